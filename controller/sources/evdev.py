@@ -49,17 +49,31 @@ SINGLE_TOUCH_AXES = {
 }
 """Axes of a slot, and the corresponding axes of a panel for a single finger."""
 
-_OF_ONE_FINGER = {(EV_ABS, single): (EV_ABS, axis) for axis, single in SINGLE_TOUCH_AXES.items()}
-_OF_ONE_FINGER[EV_KEY, BTN_TOUCH] = (EV_ABS, ABS_MT_TRACKING_ID)
+_SLOT_CODES = {
+    (EV_ABS, ABS_X): ABS_MT_POSITION_X,
+    (EV_ABS, ABS_Y): ABS_MT_POSITION_Y,
+    (EV_ABS, ABS_PRESSURE): ABS_MT_PRESSURE,
+    (EV_KEY, BTN_TOUCH): ABS_MT_TRACKING_ID,
+}
+"""Codes of the axes of a slot, by type and code of the events of a panel for a single finger."""
 
 _GRAVITY = 9.81  # m/s²
+
+REPEAT_INTERVAL = 0.05  # s; a panel at rest is silent, but contacts time out without frames
+
+_LIGHT_PRESS = {"light_pressure": ABS_MT_PRESSURE, "light_major": ABS_MT_TOUCH_MAJOR}
+"""Axes of the URL's options."""
 
 
 def as_slot_event(event: InputEvent) -> InputEvent:
     """Convert an event of a single-finger panel to one of a panel with one slot."""
     time, kind, code, value = event
-    id_or_value = value - 1 if kind == EV_KEY else value  # pressed is 1, released 0
-    return (time, *_OF_ONE_FINGER.get((kind, code), (kind, code)), id_or_value)
+    if kind == EV_KEY:
+        value -= 1  # 0, a tracking id, if pressed; -1 if released
+    slot_code = _SLOT_CODES.get((kind, code))
+    if slot_code is None:
+        return time, kind, code, value
+    return time, EV_ABS, slot_code, value
 
 
 @dataclass(frozen=True)
@@ -123,16 +137,19 @@ class SlotReader:
         self._current = 0
         self._pending: list[tuple[Touch, ...]] = []  # intermediate states of this report
         self._changed: set[int] = set()  # slots whose contact has changed within this report
-        self._dropped = False
+        self._has_lost_events = False
 
     @property
     def touches(self) -> tuple[Touch, ...]:
         """All touches, by slot; the second of two with one tracking id gets an id of its slot."""
         touches: dict[int, Touch] = {}
         for number, slot in sorted(self._slots.items()):
-            if (touch := self._touch(slot)) is not None:
-                id = touch.id if touch.id not in touches else -1 - number
-                touches[id] = touch if id == touch.id else replace(touch, id=id)
+            touch = self._touch(slot)
+            if touch is None:
+                continue
+            if touch.id in touches:
+                touch = replace(touch, id=-1 - number)
+            touches[touch.id] = touch
         return tuple(touches.values())
 
     def feed(self, kind: int, code: int, value: int) -> PanelReport | None:
@@ -140,26 +157,36 @@ class SlotReader:
 
         Slots that are negative are ignored. Raises InputError for type A.
         """
-        if kind == EV_ABS:
-            if code == ABS_MT_SLOT:
-                self._current = value
-            elif code in SLOT_AXES and self._current >= 0:
-                if code == ABS_MT_TRACKING_ID:
-                    if self._current in self._changed and not self._dropped:
-                        self._pending.append(self.touches)
-                    self._changed.add(self._current)
-                setattr(self._slots.setdefault(self._current, SlotState()), SLOT_AXES[code], value)
+        if kind == EV_ABS and code == ABS_MT_SLOT:
+            self._current = value
+        elif kind == EV_ABS and code in SLOT_AXES and self._current >= 0:
+            self._set_axis(code, value)
         elif kind == EV_SYN and code == SYN_MT_REPORT:
             raise InputError(TYPE_A)
         elif kind == EV_SYN and code == SYN_DROPPED:
-            self._dropped = True
+            self._has_lost_events = True
         elif kind == EV_SYN and code == SYN_REPORT:
-            if self._dropped:  # the events since then are incomplete
-                self._slots.clear()
-            report = PanelReport((*self._pending, self.touches), is_partial=self._dropped)
-            self._pending, self._changed, self._dropped = [], set(), False
-            return report
+            return self._finish_report()
         return None
+
+    def _set_axis(self, code: int, value: int) -> None:
+        """Set an axis of the current slot; a second contact in a slot begins another state."""
+        if code == ABS_MT_TRACKING_ID:
+            if self._current in self._changed and not self._has_lost_events:
+                self._pending.append(self.touches)
+            self._changed.add(self._current)
+        slot = self._slots.setdefault(self._current, SlotState())
+        setattr(slot, SLOT_AXES[code], value)
+
+    def _finish_report(self) -> PanelReport:
+        """Return the report that ends, and prepare the next one."""
+        if self._has_lost_events:
+            self._slots.clear()
+        report = PanelReport((*self._pending, self.touches), is_partial=self._has_lost_events)
+        self._pending = []
+        self._changed = set()
+        self._has_lost_events = False
+        return report
 
     def resynchronise(self, slots: Mapping[int, SlotState], *, current: int) -> None:
         """Replace all state by the kernel's; current: slot of the next event."""
@@ -172,14 +199,12 @@ class SlotReader:
             return None
         if slot.tool not in (MT_TOOL_FINGER, MT_TOOL_PALM) or slot.distance > 0:
             return None
-        return Touch(
-            slot.tracking_id,
-            self._share(ABS_MT_POSITION_X, slot.x),
-            self._share(ABS_MT_POSITION_Y, slot.y),
-            HAND_LOAD
-            if slot.tool == MT_TOOL_PALM
-            else self._light_press.load(pressure=slot.pressure, touch_major=slot.touch_major),
-        )
+        load: float | None = HAND_LOAD
+        if slot.tool == MT_TOOL_FINGER:
+            load = self._light_press.load(pressure=slot.pressure, touch_major=slot.touch_major)
+        x = self._share(ABS_MT_POSITION_X, slot.x)
+        y = self._share(ABS_MT_POSITION_Y, slot.y)
+        return Touch(slot.tracking_id, x, y, load)
 
     def _share(self, code: int, value: int) -> float:
         """Return a value relative to the range of its axis, 0..1."""
@@ -187,23 +212,24 @@ class SlotReader:
         return (value - low) / (high - low)
 
 
-def light_press(resolutions: Mapping[int, int], given: Mapping[int, float]) -> LightPress:
+def light_press(resolutions: Mapping[int, int], stated: Mapping[int, float]) -> LightPress:
     """Return the values of a panel's axes under a finger that presses lightly.
 
-    resolutions: by axis, 0 or left out where the panel states none: units per millimetre, of a
-    pressure units per gram, without which its unit is arbitrary (the kernel's
-    input-event-codes.rst). A contact without its own is in the unit of positions. given: such
-    values by axis, 0 for one that is not to be used.
+    resolutions: by axis, in units per millimetre, or units per gram for a pressure; 0 or missing if
+    the panel does not state it. A pressure without resolution has an arbitrary unit (the kernel's
+    input-event-codes.rst); a contact size without resolution has the unit of positions. stated:
+    values from the URL by axis, which take precedence; 0 disables an axis.
     """
     pressure = resolutions.get(ABS_MT_PRESSURE, 0) * 1000 * LIGHT_FORCE / _GRAVITY
     per_mm = resolutions.get(ABS_MT_TOUCH_MAJOR, 0) or resolutions.get(ABS_MT_POSITION_X, 0)
     return LightPress(
-        pressure=given.get(ABS_MT_PRESSURE, pressure) or None,
-        touch_major=given.get(ABS_MT_TOUCH_MAJOR, per_mm * LIGHT_MAJOR) or None,
+        pressure=stated.get(ABS_MT_PRESSURE, pressure) or None,
+        touch_major=stated.get(ABS_MT_TOUCH_MAJOR, per_mm * LIGHT_MAJOR) or None,
     )
 
 
-_READ, _WRITE = 2, 1
+_READ = 2
+_WRITE = 1
 _EVENT = struct.Struct("llHHi")  # struct input_event: time of two longs, type, code, value
 _AXIS = struct.Struct("6i")  # struct input_absinfo: value, minimum, maximum, fuzz, flat, resolution
 _INT = struct.Struct("i")
@@ -248,28 +274,23 @@ class InputDevice:
 
     def __init__(self, path: str, *, grab: bool = False) -> None:
         self.path = path
+        self.ranges: dict[int, Range] = {}
+        """Ranges of the axes ABS_MT_POSITION_X and _Y."""
+        self.resolutions: dict[int, int] = {}
+        """Resolutions of the axes that `light_press` uses; 0 for missing axes."""
+        self._axis_codes: dict[int, int] = {}  # codes of axes outside the slots
+        self._slot_count = 1
         try:
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
             raise InputError(f"touch source {path}: {_advice(error, path)}") from error
         try:
-            self._axis_codes: dict[int, int] = {}  # codes of axes outside the slots
-            if self._axis(ABS_MT_POSITION_X)[1:3] == (0, 0):  # the axis is missing
-                self._axis_codes = SINGLE_TOUCH_AXES
-            self.ranges = {
-                axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
-            }
-            measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
-            self.resolutions = {axis: self._axis(axis)[3] for axis in measured}  # 0: no axis
-            self._slot_count = self._axis(ABS_MT_SLOT)[2] + 1
-            with contextlib.suppress(OSError):  # of an older kernel: see `moment_of`
-                fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
-            if grab:
-                fcntl.ioctl(self._descriptor, GRAB, 1)
-        except (InputError, OSError) as error:
+            self._set_up(grab=grab)
+        except InputError:
             self.close()
-            if isinstance(error, InputError):
-                raise
+            raise
+        except OSError as error:
+            self.close()
             if error.errno == errno.EBUSY:
                 raise InputError(
                     f"touch source {path}: grabbed by another program; stop that one "
@@ -279,6 +300,19 @@ class InputDevice:
                 f"touch source {path}: must be a touch panel ({error.strerror}); `libinput "
                 "list-devices` or `evtest` list the devices"
             ) from error
+
+    def _set_up(self, *, grab: bool) -> None:
+        """Read the properties of the axes, and set the clock of the events."""
+        if self._axis(ABS_MT_POSITION_X)[1:3] == (0, 0):  # the axis is missing
+            self._axis_codes = SINGLE_TOUCH_AXES
+        self.ranges = {axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)}
+        measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
+        self.resolutions = {axis: self._axis(axis)[3] for axis in measured}
+        self._slot_count = self._axis(ABS_MT_SLOT)[2] + 1
+        with contextlib.suppress(OSError):  # an older kernel; see `frame_moment`
+            fcntl.ioctl(self._descriptor, CLOCK, _INT.pack(time.CLOCK_MONOTONIC))
+        if grab:
+            fcntl.ioctl(self._descriptor, GRAB, 1)
 
     def fileno(self) -> int:
         """Return the descriptor for a selector."""
@@ -297,7 +331,7 @@ class InputDevice:
         if self._axis_codes:
             keys = fcntl.ioctl(self._descriptor, PRESSED_KEYS, bytes(_KEYS))
             is_down = keys[BTN_TOUCH // 8] >> BTN_TOUCH % 8 & 1
-            x, y, pressure = (self._axis(axis)[0] for axis in SINGLE_TOUCH_AXES)
+            x, y, pressure = [self._axis(axis)[0] for axis in SINGLE_TOUCH_AXES]
             return {0: SlotState(is_down - 1, x, y, pressure=pressure)}
         states = zip(*map(self._slot_values, SLOT_AXES), strict=True)
         return {slot: SlotState(*state) for slot, state in enumerate(states)}
@@ -339,10 +373,9 @@ class InputDevice:
     def _slot_values(self, axis: int) -> tuple[int, ...]:
         """Return the value of an axis in every slot."""
         layout = struct.Struct(f"{1 + self._slot_count}i")
-        buffer = layout.pack(axis, *([0] * self._slot_count))
-        _, *values = layout.unpack(
-            fcntl.ioctl(self._descriptor, eviocgmtslots(layout.size), buffer)
-        )
+        request = layout.pack(axis, *([0] * self._slot_count))
+        reply = fcntl.ioctl(self._descriptor, eviocgmtslots(layout.size), request)
+        _, *values = layout.unpack(reply)
         return tuple(values)
 
 
@@ -356,11 +389,6 @@ def _advice(error: OSError, path: str) -> str:
     if error.errno == errno.ENOENT:
         return "no such device; `ls -l /dev/input/by-id` lists the connected devices"
     return f"{path} cannot be opened: {error.strerror}"
-
-
-REPEAT_INTERVAL = 0.05  # s; a panel at rest is silent, but contacts time out without frames
-
-_LIGHT_PRESS = {"light_pressure": ABS_MT_PRESSURE, "light_major": ABS_MT_TOUCH_MAJOR}
 
 
 class EvdevSource(TouchSource):
@@ -393,8 +421,9 @@ class EvdevSource(TouchSource):
         try:
             await self._follow(panel, deliver)
         except OSError as error:
-            lost = f"lost ({error.strerror}); plug it in again"
-            reason = TYPE_A if error.errno == errno.EINVAL else lost
+            reason = f"lost ({error.strerror}); plug it in again"
+            if error.errno == errno.EINVAL:
+                reason = TYPE_A
             raise InputError(f"touch source {self._path}: {reason}") from error
         finally:
             panel.close()
@@ -404,8 +433,7 @@ class EvdevSource(TouchSource):
         loop = asyncio.get_running_loop()
         press = light_press(panel.resolutions, self._light_values)
         reader = SlotReader(panel.ranges, light_press=press)
-        reader.resynchronise(panel.slots(), current=panel.current_slot)
-        self._deliver(deliver, reader.touches)
+        self._deliver_state(panel, reader, deliver)
         readable = asyncio.Event()
         loop.add_reader(panel.fileno(), readable.set)
         try:
@@ -414,43 +442,55 @@ class EvdevSource(TouchSource):
                     async with asyncio.timeout(REPEAT_INTERVAL if reader.touches else None):
                         await readable.wait()
                 except TimeoutError:
-                    reader.resynchronise(panel.slots(), current=panel.current_slot)
-                    self._deliver(deliver, reader.touches)
+                    self._deliver_state(panel, reader, deliver)
                     continue
                 readable.clear()
-                for happened, *event in panel.read():
-                    report = reader.feed(*event)
+                for event_time, kind, code, value in panel.read():
+                    report = reader.feed(kind, code, value)
                     if report is None:
                         continue
                     if report.is_partial:
-                        reader.resynchronise(panel.slots(), current=panel.current_slot)
-                        self._deliver(deliver, reader.touches, happened)
-                    else:
-                        for touches in report.states:
-                            self._deliver(deliver, touches, happened)
+                        self._deliver_state(panel, reader, deliver, event_time)
+                        continue
+                    for touches in report.states:
+                        self._deliver(touches, deliver, event_time)
         finally:
             loop.remove_reader(panel.fileno())
 
+    def _deliver_state(
+        self,
+        panel: InputDevice,
+        reader: SlotReader,
+        deliver: Callable[[TouchFrame], None],
+        event_time: float = -math.inf,
+    ) -> None:
+        """Deliver a frame of the kernel's state; raises OSError if the panel is unplugged."""
+        reader.resynchronise(panel.slots(), current=panel.current_slot)
+        self._deliver(reader.touches, deliver, event_time)
+
     def _deliver(
         self,
-        deliver: Callable[[TouchFrame], None],
         touches: tuple[Touch, ...],
-        happened: float = -math.inf,
+        deliver: Callable[[TouchFrame], None],
+        event_time: float,
     ) -> None:
-        """Deliver a frame of what happened at a time [s], now if that is not of this clock."""
-        at = frame_moment(happened, asyncio.get_running_loop().time())
-        deliver(TouchFrame(self._name, at, touches))
+        """Deliver a frame of an event at a time [s]; now if that is from another clock."""
+        frame_time = frame_moment(event_time, asyncio.get_running_loop().time())
+        deliver(TouchFrame(self._name, frame_time, touches))
 
 
 def _panel_options(options: str) -> tuple[dict[str, str], dict[int, float]]:
-    """Return the options of a panel: others, and values under a light press by axis.
+    """Return the options of a panel, and separately its values under a light press by axis.
 
-    A value that is no number of at least 0 is among the others.
+    A value that is not a number of at least 0 stays among the options.
     """
-    others, by_axis = dict(parse_qsl(options, keep_blank_values=True)), {}
+    remaining = dict(parse_qsl(options, keep_blank_values=True))
+    light_values = {}
     for name, axis in _LIGHT_PRESS.items():
-        value = number_option(f"{name}={others[name]}", name, default=0) if name in others else -1
+        if name not in remaining:
+            continue
+        value = number_option(f"{name}={remaining[name]}", name, default=0)
         if 0 <= value < math.inf:
-            by_axis[axis] = value
-            del others[name]
-    return others, by_axis
+            light_values[axis] = value
+            del remaining[name]
+    return remaining, light_values

@@ -17,7 +17,7 @@ from urllib.parse import quote
 import numpy as np
 
 from controller.config_kind import CheckedFile, ConfigKind
-from drivers.by_hand.reaching import arrangement_of, check_links
+from drivers.by_hand.links import arrangement_of, check_links
 from model.config.document import ConfigError, ConfigProblem, Document
 from model.errors import InputError
 from model.quantities import percent

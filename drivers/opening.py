@@ -31,11 +31,11 @@ class _OpenLine:
 class Lines:
     """The open lines of a host; amplifiers at one port, connection or bus share a line.
 
-    before: earlier lines of the host, now closed; their request numbers are continued.
+    last: earlier lines of the host, now closed; their request numbers are continued.
     """
 
-    def __init__(self, before: "Lines | None" = None) -> None:
-        self._wires: dict[str, Wire] = {} if before is None else before._wires
+    def __init__(self, last: "Lines | None" = None) -> None:
+        self._wires: dict[str, Wire] = {} if last is None else last._wires
         self.is_closing = False
         """Whether their owner is closing them: lines opened meanwhile belong to others."""
         self._opened: dict[str, _OpenLine] = {}
@@ -57,7 +57,8 @@ class Lines:
         for an invalid URL, LinkError for a line that cannot be opened or an address in use by an
         amplifier of another name; an amplifier of this name is replaced.
         """
-        address, before = address_of(url), self._opened
+        address = address_of(url)
+        open_lines = self._opened
         async with self._changing.setdefault(address.line, asyncio.Lock()):
             opened = self._opened.get(address.line)
             if opened is not None and opened.line.loss is not None:
@@ -66,7 +67,7 @@ class Lines:
                 opened = None
             if opened is None:
                 opened = await self.open_line(address)
-                if self._opened is not before:
+                if self._opened is not open_lines:  # `close` was called meanwhile
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")
                 self._opened[address.line] = opened
@@ -86,21 +87,23 @@ class Lines:
     async def open_line(self, address: WireAddress) -> _OpenLine:
         """Open the line of an amplifier, for the first of its amplifiers."""
         line = Line(address.make_wire(), address.line, boot_time=address.boot_time)
-        if (before := self._wires.get(address.line)) is not None:
-            line.wire.follow(before)
+        last_wire = self._wires.get(address.line)
+        if last_wire is not None:
+            line.wire.follow(last_wire)
         self._wires[address.line] = line.wire
         port = await address.open_port(line.received, line.lose)
         line.open(port)
         return _OpenLine(line, port, address.settings)
 
     async def close(self) -> None:
-        """Close all lines; disarm before, or vibrations last until the watchdogs trip.
+        """Close all lines; disarm first, or vibrations continue until the watchdogs trip.
 
-        A second call waits for the first. Lines are closed though the caller is cancelled.
+        A second call waits for the first. Lines are closed even if the caller is cancelled.
         """
-        opened, self._opened = self._opened, {}
-        for each in opened.values():
-            closing = asyncio.create_task(each.close(), name=f"close {each.line.name}")
+        open_lines = self._opened
+        self._opened = {}
+        for opened in open_lines.values():
+            closing = asyncio.create_task(opened.close(), name=f"close {opened.line.name}")
             self._closing.add(closing)
             closing.add_done_callback(self._closing.discard)
         if self._closing:

@@ -23,48 +23,57 @@ CLOCK_ERRORS: Mapping[str, float] = {
     "can-usb": 3e-6,
     "ethernet": 4e-6,
 }
-"""Error of a clock that is held over a line of a kind, rms [s].
+"""RMS error of a clock that is steered over a line, by kind of line [s].
 
-The largest that `python -m benchmarks.clocks` prints of a kind, from 1 s after arming on; not
-of a bus without Marks, whose clocks are known less well at first.
+The largest error that `python -m benchmarks.clocks` prints for the kind, from 1 s after arming. Not
+valid for a bus without Marks, whose clocks are known less accurately at first.
 """
 
 BUS_ERROR: Final = 7e-6
-"""The same at most on one bus of any kind, whose Marks say how its clocks differ, rms [s]."""
+"""Maximum RMS error on one bus of any kind with Marks, which compare its clocks [s]."""
 
 SIMULATED: Final = "usb-high-speed"
-"""Of a simulated amplifier whose URL names no kind, where a rig has several."""
+"""Kind of line of a simulated amplifier without a stated kind, in a rig with several."""
 KIND_OF_PORT: Mapping[str, str] = {
     "ttyUSB": "ftdi-low-latency",
     "ttyACM": "usb-full-speed",
-    **dict.fromkeys(("ttyS", "ttyAMA", "ttyO", "ttyPS", "ttymxc", "ttyTHS", "ttySC"), "native"),
+    "ttyS": "native",
+    "ttyAMA": "native",
+    "ttyO": "native",
+    "ttyPS": "native",
+    "ttymxc": "native",
+    "ttyTHS": "native",
+    "ttySC": "native",
 }
-"""By the name of a serial port without its number."""
+"""Kind of line by the name of a serial port without its number."""
 KIND_OF_SCHEME: Mapping[str, str] = {
-    **dict.fromkeys(("serial+tcp", "modbus+tcp", "can+socketcand"), "ethernet"),
-    **dict.fromkeys(("can+socketcan", "can+python-can"), "can"),
+    "serial+tcp": "ethernet",
+    "modbus+tcp": "ethernet",
+    "can+socketcand": "ethernet",
+    "can+socketcan": "can",
+    "can+python-can": "can",
     "can+slcan": "can-usb",
     "sim": SIMULATED,
 }
-"""By the scheme of a URL that names no serial port."""
+"""Kind of line by the scheme of a URL without a serial port."""
 SCHEMES_OF_PORTS: Final = ("serial", "modbus+rtu")
 """Schemes of URLs that name a serial port."""
 UNKNOWN_KIND: Final = "usb-full-speed"
-"""Assumed for a port of another name and for the scheme of a plug-in."""
+"""Kind of line assumed for other port names and for schemes of plug-ins."""
 
 
 def line_kind_of(url: str) -> str:
     """Return the kind of line of an amplifier's URL; a key of `CLOCK_ERRORS` if it is valid."""
-    scheme, _, rest = url.partition("://")
+    scheme, _, location = url.partition("://")
     scheme = scheme.lower()
-    query = rest.partition("?")[2].partition("#")[0]
+    query = location.partition("?")[2].partition("#")[0]
     stated_kind = dict(parse_qsl(query)).get("line")
     if stated_kind:
         return stated_kind
-    if scheme in SCHEMES_OF_PORTS:
-        port = re.match(r"/dev/([a-zA-Z]+)\d", rest)
-        return KIND_OF_PORT.get(port[1], UNKNOWN_KIND) if port else UNKNOWN_KIND
-    return KIND_OF_SCHEME.get(scheme, UNKNOWN_KIND)
+    if scheme not in SCHEMES_OF_PORTS:
+        return KIND_OF_SCHEME.get(scheme, UNKNOWN_KIND)
+    port = re.match(r"/dev/([a-zA-Z]+)\d", location)
+    return KIND_OF_PORT.get(port[1], UNKNOWN_KIND) if port else UNKNOWN_KIND
 
 
 ADDRESS: Final = 1
@@ -72,9 +81,9 @@ ADDRESS: Final = 1
 BAUD: Final = 921_600
 """Default of a serial line [baud]; 8 data bits, no parity, 1 stop bit."""
 RTU_BAUD: Final = 115_200
-"""Of a Modbus line whose URL names none [baud]; 8 data bits, even parity, 1 stop bit."""
+"""Default of a Modbus line [baud]; 8 data bits, even parity, 1 stop bit."""
 ADDRESS_MAX: Final = 247
-"""Of a unit, and of an address on a serial line, so that one label serves both."""
+"""Maximum unit, and maximum address on a serial line, so that one label serves both."""
 
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
 _DIGITS_MAX = 9  # more are out of every range, and int() rejects thousands of digits
@@ -82,7 +91,7 @@ _DIGITS_MAX = 9  # more are out of every range, and int() rejects thousands of d
 
 @dataclass(frozen=True)
 class Endpoint:
-    """What carries bytes: a serial device of this machine, or a port of the network.
+    """A serial device of this machine, or a network port.
 
     baud, parity (as named by pyserial) and stop bits belong to the device, or to the line behind a
     gateway; baud is 0 if unknown.
@@ -102,8 +111,11 @@ class Endpoint:
 
     @property
     def byte_time(self) -> float:
-        """How long a byte takes [s], with start, parity and stop bits; 0 if unknown."""
-        return (9 + (self.parity != "N") + self.stop) / self.baud if self.baud else 0.0
+        """Duration of a byte [s] with start, parity and stop bits; 0 if unknown."""
+        if not self.baud:
+            return 0.0
+        parity_bits = 0 if self.parity == "N" else 1
+        return (9 + parity_bits + self.stop) / self.baud
 
 
 class AmplifierUrl:
@@ -114,38 +126,42 @@ class AmplifierUrl:
     """
 
     def __init__(self, url: str, form: str, known: Collection[str] = ()) -> None:
-        self._url, self._form = url, form
-        scheme, _, rest = url.partition("://")
+        self._url = url
+        self._form = form
+        scheme, _, location = url.partition("://")
         self.scheme = scheme.lower()
-        # In the path of a device # is a letter as any other, unless an address follows.
-        letter = r"#(?!\d+$)" if self.scheme == "serial" else r"#(?=.*#)"
+        # In the path of a device, # is an ordinary character unless an address follows.
+        ordinary = r"#(?!\d+$)" if self.scheme == "serial" else r"#(?=.*#)"
         try:
-            parts = urlsplit(f"//{re.sub(letter, '%23', rest)}")
-            self.host, self.port = parts.hostname or "", parts.port or 0
+            parts = urlsplit("//" + re.sub(ordinary, "%23", location))
+            self.host = parts.hostname or ""
+            self.port = parts.port or 0
         except ValueError as error:
             raise self.refused(f"URL must be valid: {error}") from None
-        self.place, self.number = parts.netloc, parts.fragment
-        self.path = unquote(parts.path, errors="surrogateescape")  # names of files are bytes
+        self.place = parts.netloc
+        self.number = parts.fragment
+        self.path = unquote(parts.path, errors="surrogateescape")  # file names are bytes
         pairs = parse_qsl(parts.query, keep_blank_values=True, errors="surrogateescape")
         self.options = dict(pairs)
-        known = (*known, "line")
-        unknown = sorted(self.options.keys() - set(known))
-        self.require(
-            not unknown,
-            f"option {', '.join(unknown)} is unknown; known: {', '.join(known)}",
-        )
+        self._check_options((*known, "line"))
         self.require(len(pairs) == len(self.options), "an option must not be repeated")
         kind = self.options.get("line", "prompt")
+        kinds = ", ".join(CLOCK_ERRORS)
+        self.require(kind in CLOCK_ERRORS, f"line must be one of {kinds}, got {kind!r}")
+
+    def _check_options(self, names: Collection[str]) -> None:
+        """Raise CommandError for an option without one of these names."""
+        unknown = sorted(self.options.keys() - set(names))
         self.require(
-            kind in CLOCK_ERRORS, f"line must be one of {', '.join(CLOCK_ERRORS)}, got {kind!r}"
+            not unknown, f"option {', '.join(unknown)} is unknown; known: {', '.join(names)}"
         )
 
     def refused(self, why: str) -> CommandError:
-        """Return the error for a URL that is invalid: why, as `X must be Y`."""
+        """Return the error for an invalid URL; why: as `X must be Y`."""
         return CommandError(f"{self._url!r}: {why}; use {self._form}")
 
     def require(self, is_right: bool, why: str) -> None:
-        """Raise CommandError, and why as `refused`, unless the URL is right in something."""
+        """Raise CommandError unless a condition is met; why: see `refused`."""
         if not is_right:
             raise self.refused(why)
 
@@ -159,7 +175,7 @@ class AmplifierUrl:
         return int(text)
 
     def whole_option(self, name: str, default: int, high: int, *, low: int = 1) -> int:
-        """Parse an option that is an integer of a range."""
+        """Parse an option that is an integer in a range."""
         return self.whole(self.options.get(name, str(default)), name, high, low=low)
 
     def device(self, baud: int) -> Endpoint:
@@ -171,32 +187,38 @@ class AmplifierUrl:
         return Endpoint(self.path, baud=self._baud(baud))
 
     def server(self, *, port: int = 0, number: str = "") -> Endpoint:
-        """Return the port of the network; port: the default; number: see `check_path`."""
+        """Return the network port; port: default; number: see `check_path`."""
         if number:
             self.check_path(self.path, number)
-        for name, value in (("host", self.host), ("port", self.port or port)):
-            self.require(bool(value), f"{name} must be given, got {self.place!r}")
-        return Endpoint(host=self.host, port=self.port or port, baud=self._baud(0))
+        port = self.port or port
+        self.require(bool(self.host), f"host must be given, got {self.place!r}")
+        self.require(bool(port), f"port must be given, got {self.place!r}")
+        return Endpoint(host=self.host, port=port, baud=self._baud(0))
 
     def check_path(self, rest: str, number: str) -> None:
-        """Refuse the rest of a path; number: of an amplifier, as it must be given in its place."""
+        """Reject anything in the rest of a path; number: how an amplifier's number is given."""
         rest = rest.strip("/")
         self.require(not rest, f"{number.format(rest)}, got /{rest} in the path")
 
     def _baud(self, default: int) -> int:
-        return self.whole_option("baud", default, _BAUD_MAX) if "baud" in self.options else default
+        if "baud" not in self.options:
+            return default
+        return self.whole_option("baud", default, _BAUD_MAX)
 
 
 def with_address(url: str, address: int) -> str:
     """Return the URL with another address, unit or node; CommandError for a wire without any."""
     scheme = url.partition("://")[0]
     if scheme in ("serial", "serial+tcp"):
-        kept = re.sub(r"(?<=[?&])address=\d+&?", "", url).rstrip("?&")
-        return f"{kept}{'&' if '?' in kept else '?'}address={address}"
+        without_address = re.sub(r"(?<=[?&])address=\d+&?", "", url).rstrip("?&")
+        separator = "&" if "?" in without_address else "?"
+        return f"{without_address}{separator}address={address}"
     if scheme == "modbus+tcp":
-        place, _, options = url.partition("?")
-        host = "/".join(place.split("/")[:3])
-        return f"{host}/{address}" + (f"?{options}" if options else "")
+        location, _, options = url.partition("?")
+        host = "/".join(location.split("/")[:3])
+        query = f"?{options}" if options else ""
+        return f"{host}/{address}{query}"
     if scheme == "modbus+rtu" or scheme.startswith("can"):
-        return f"{url.rpartition('#')[0] or url}#{address}"
+        without_number = url.rpartition("#")[0] or url
+        return f"{without_number}#{address}"
     raise CommandError(f"amplifiers at {url} have no address that can be set")

@@ -26,7 +26,7 @@ from controller.process.daemon_process import check_socket_path
 from controller.rig_file_check import clock_costs, whole_url
 from controller.sources.touch import TouchSource, open_source
 from controller.sources.touch_calibration import TouchCalibration, fit_touch_calibration, turned
-from drivers.by_hand.reaching import check_links
+from drivers.by_hand.links import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, is_file_name, read_document
 from model.config.fields import FileName, Quantity, Section, Validation

@@ -19,17 +19,8 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any
 
-from drivers.by_hand.reaching import (
-    capability_rows,
-    fault_rows,
-    identified,
-    in_units,
-    keep_alive,
-    random_session,
-    reached,
-    status_rows,
-    wire_rows,
-)
+from drivers.by_hand.reaching import identified, keep_alive, random_session, reached
+from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_rows, wire_rows
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.ledger import StagedSet, StopOutcome
@@ -81,7 +72,7 @@ async def identify_amplifier(url: str) -> dict[str, Any]:
 async def status(url: str) -> dict[str, Any]:
     """Read status, faults and link timing."""
     async with identified(url) as amplifier:
-        now = await amplifier.read_status()
+        present = await amplifier.read_status()
         faults = await amplifier.request("GetFaults", {})
         measured = [
             {"voltage_v": voltage, "current_a": current}
@@ -89,7 +80,7 @@ async def status(url: str) -> dict[str, Any]:
         ]
         return {
             "url": url,
-            **status_rows(now),
+            **status_rows(present),
             "measured": measured,
             "faults": fault_rows(faults),
             "last_round_trip_s": amplifier.counts.last_round_trip,
@@ -101,13 +92,13 @@ async def read_electrical(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
     if not has_feature(amplifier.ledger.capabilities, "electrical"):
         return []
-    measured = await amplifier.request("GetMeasured", {}, Priority.READING)
-    voltage = QUANTITIES["channel_voltage"]
-    current = QUANTITIES["channel_current"]
-    return [
-        (voltage.from_wire(row["channel_voltage"]), current.from_wire(row["channel_current"]))
-        for row in measured["channels"]
-    ]
+    reply = await amplifier.request("GetMeasured", {}, Priority.READING)
+    readings = []
+    for row in reply["channels"]:
+        voltage = QUANTITIES["channel_voltage"].from_wire(row["channel_voltage"])
+        current = QUANTITIES["channel_current"].from_wire(row["channel_current"])
+        readings.append((voltage, current))
+    return readings
 
 
 async def stop(url: str) -> dict[str, Any]:
@@ -123,20 +114,22 @@ async def stop(url: str) -> dict[str, Any]:
                 rows = status_rows(amplifier.status)
     except LinkError as error:
         cause = f"{error}; {_UNKNOWN}"
-    stopped = StopOutcome(not cause, math.inf, cause)  # another host may feed it
-    return {"url": url, **stopped.rows(threads.now()), **rows}
+    outcome = StopOutcome(not cause, math.inf, cause)  # another host may feed it
+    return {"url": url, **outcome.rows(threads.now()), **rows}
 
 
 async def _stop(amplifier: Amplifier) -> str:
     """Stop an amplifier immediately and until silence is confirmed; returns why it is not."""
-    cause, until = "", threads.now() + BOOT_TIME
+    cause = ""
+    until = threads.now() + BOOT_TIME
     identifying: asyncio.Future[Any] | None = None
     while identifying is None or not identifying.done():  # takes long if a board may restart
         with contextlib.suppress(DriverError):
             if threads.now() < until:
                 values = {"ramp": amplifier.wire_ramp(STOP_RAMP)}
                 await amplifier.request("Stop", values, Priority.STOP)
-        identifying = identifying or asyncio.ensure_future(amplifier.identify())
+        if identifying is None:
+            identifying = asyncio.ensure_future(amplifier.identify())
         await asyncio.wait([identifying], timeout=_STOP_INTERVAL)
     try:
         identifying.result()
@@ -150,14 +143,14 @@ async def _stop(amplifier: Amplifier) -> str:
 
 async def set_address(url: str, address: int, serial_number: str | None) -> dict[str, Any]:
     """Change the address of the amplifier at a URL, or of the one with a serial number."""
-    moved = with_address(url, address)
+    new_url = with_address(url, address)
     if serial_number is None:
         async with identified(url) as amplifier:
             serial_number = amplifier.identity["serial_number"]
             if not has_feature(amplifier.capabilities, "address"):
                 raise CommandError("the address of this amplifier cannot be set over its wire")
-            state = name_of(STATES, (await amplifier.read_status())["state"])
-            if state != "SWITCH_ON_DISABLED":
+            present = await amplifier.read_status()
+            if name_of(STATES, present["state"]) != "SWITCH_ON_DISABLED":
                 raise CommandRefused("an address is set while disarmed; disarm the amplifier first")
             await _set_address(amplifier, address, serial_number)
     else:
@@ -166,8 +159,8 @@ async def set_address(url: str, address: int, serial_number: str | None) -> dict
             with contextlib.suppress(CommandRefused, LinkError):
                 await _set_address(amplifier, address, serial_number)
     await asyncio.sleep(_TAKING_ADDRESS)
-    async with identified(moved, serial_number=serial_number):
-        return {"url": moved, "serial_number": serial_number}
+    async with identified(new_url, serial_number=serial_number):
+        return {"url": new_url, "serial_number": serial_number}
 
 
 async def _set_address(amplifier: Amplifier, address: int, serial_number: str) -> None:
@@ -185,8 +178,9 @@ async def leave(url: str) -> str:
     """Silence an amplifier whose checks were ended, and clear that; returns how it is left."""
     remedy = f"era amp clear {shlex.quote(url)}"
     try:
-        cause = (await stop(url))["cause"].removesuffix(f"; {_UNKNOWN}")
-        shown = {} if cause else await clear(url)
+        stopped = await stop(url)
+        cause = stopped["cause"].removesuffix(f"; {_UNKNOWN}")
+        cleared = {} if cause else await clear(url)
     except DriverError as error:
         cause = str(error)
     if cause:
@@ -195,9 +189,10 @@ async def leave(url: str) -> str:
             f"{url} is not confirmed to be silent: {cause}. Its watchdog silences it within "
             f"{watchdog}, and leaves it in FAULT; once it can be reached: {remedy}"
         )
-    left = f"{url} is left in {shown['state']}, fault {shown['fault']}"
-    is_off = shown["state"] == "SWITCH_ON_DISABLED"
-    return f"{left}, silent" if is_off else f"{left}; once the cause is gone: {remedy}"
+    sentence = f"{url} is left in {cleared['state']}, fault {cleared['fault']}"
+    if cleared["state"] == "SWITCH_ON_DISABLED":
+        return f"{sentence}, silent"
+    return f"{sentence}; once the cause is gone: {remedy}"
 
 
 async def drive(
@@ -210,7 +205,8 @@ async def drive(
     async with reached(url) as amplifier:
         await amplifier.open()
         ramp = min(_RAMP, QUANTITIES["ramp"].from_wire(amplifier.capabilities["ramp_max"]))
-        layer = AmplifierLayer(0, (AmplifierTone(channel, frequency, level),), ramp, duration)
+        tone = AmplifierTone(channel, frequency, level)
+        layer = AmplifierLayer(0, (tone,), ramp, duration)
         try:
             amplifier.ledger.admit([layer], threads.now(), delay=0.0)
         except CommandRefused as refused:
@@ -218,13 +214,7 @@ async def drive(
         lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])
         watchdog = max(WATCHDOG, lowest)
         check_watchdog(watchdog, amplifier.exchange_time("Set"))
-        before = await amplifier.read_status()
-        if before["state"] in LATCHED:
-            raise CommandRefused(
-                f"the amplifier does not arm: state {name_of(STATES, before['state'])}, fault "
-                f"{name_of(FAULTS, before['fault'])}; once the cause is gone: era amp clear "
-                f"{shlex.quote(url)}"
-            )
+        await _check_not_latched(amplifier, url)
         try:
             await amplifier.arm(random_session(), watchdog)
             await amplifier.stage(_TOKEN, [layer], now=True)
@@ -235,9 +225,23 @@ async def drive(
             if amplifier.may_be_armed:  # leave the amplifier of another host alone
                 with contextlib.suppress(DriverError):
                     await amplifier.disarm(_RAMP)
-        after = await amplifier.read_status()
-    played = [{"channel": row["channel"], **in_units(COMMAND, row)} for row in achieved["commands"]]
-    return {"url": url, "achieved": played, "duration_s": duration, **status_rows(after)}
+        present = await amplifier.read_status()
+    commands = []
+    for row in achieved["commands"]:
+        commands.append({"channel": row["channel"], **in_units(COMMAND, row)})
+    return {"url": url, "achieved": commands, "duration_s": duration, **status_rows(present)}
+
+
+async def _check_not_latched(amplifier: Amplifier, url: str) -> None:
+    """Raise CommandRefused after a stop or a fault that was not cleared."""
+    present = await amplifier.read_status()
+    if present["state"] in LATCHED:
+        state = name_of(STATES, present["state"])
+        fault = name_of(FAULTS, present["fault"])
+        raise CommandRefused(
+            f"the amplifier does not arm: state {state}, fault {fault}; once the cause is gone: "
+            f"era amp clear {shlex.quote(url)}"
+        )
 
 
 class BlockingAmplifier:
@@ -296,9 +300,9 @@ class BlockingAmplifier:
 
     def stop(self) -> None:
         """Quick stop, latched until `clear`; raises CommandRefused if silence is not confirmed."""
-        stopped = self._wait(self._stopped())
-        if not stopped.is_confirmed:
-            raise CommandRefused(f"the amplifier may play: {stopped.cause}")
+        outcome = self._wait(self._stopped())
+        if not outcome.is_confirmed:
+            raise CommandRefused(f"the amplifier may play: {outcome.cause}")
 
     def clear(self) -> dict[str, Any]:
         """Acknowledge a stop or a fault; returns the status."""
@@ -331,18 +335,21 @@ class BlockingAmplifier:
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
         """
         _require_layers(layers)
-        played = self.apply([replace(layer, valid_for=duration) for layer in layers])
+        staged = self.apply([replace(layer, valid_for=duration) for layer in layers])
         self._wait(keep_alive(self._amplifier, duration, HEARTBEAT))
-        return played
+        return staged
 
     async def _applied(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         _require_layers(layers)
         for layer in layers:
             _check_steps(layer, self._amplifier.capabilities)
         self._token = token_after(self._token)
-        every, given = range(self._amplifier.capabilities["layers"]), [n.number for n in layers]
-        ended = [AmplifierLayer(number) for number in every if number not in given]
-        return await self._amplifier.stage(self._token, [*layers, *ended], now=True)
+        numbers = {layer.number for layer in layers}
+        all_layers = list(layers)
+        for number in range(self._amplifier.capabilities["layers"]):
+            if number not in numbers:
+                all_layers.append(AmplifierLayer(number))  # silence
+        return await self._amplifier.stage(self._token, all_layers, now=True)
 
     async def _stopped(self) -> StopOutcome:
         return await self._amplifier.stop()
@@ -382,5 +389,7 @@ def _check_steps(layer: AmplifierLayer, capabilities: Values) -> None:
 
 def _require_layers(layers: object) -> None:
     """Raise CommandError for anything but a sequence of layers."""
-    if not (isinstance(layers, Sequence) and all(isinstance(n, AmplifierLayer) for n in layers)):
+    if not isinstance(layers, Sequence) or not all(
+        isinstance(layer, AmplifierLayer) for layer in layers
+    ):
         raise CommandError(f"layers must be a list of AmplifierLayer, got {type(layers).__name__}")

@@ -45,7 +45,7 @@ app.add_typer(amp, name="amp")
 
 @app.callback()
 def _group() -> None:
-    """Keep `amp` a command group even if the app has no other."""
+    """Keep `amp` a command group, even as the only one of the app."""
 
 
 Url = Annotated[
@@ -82,16 +82,17 @@ def discover(
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
-    from drivers.by_hand.reaching import discover as discovered
+    from drivers.by_hand import discovery
 
-    result, problems = run(discovered(url or [], probes=probe), trace)
+    result, problems = run(discovery.discover(url or [], probes=probe), trace)
     if json_:
         print(json.dumps(result))
     else:
         _show_discovered(result, problems)
     for problem in problems.values():  # the first one decides, as for a single URL
-        kind = next(kind for kind in EXIT_STATUS if isinstance(problem, kind))
-        raise typer.Exit(EXIT_STATUS[kind])
+        for kind, exit_status in EXIT_STATUS.items():
+            if isinstance(problem, kind):
+                raise typer.Exit(exit_status)
 
 
 def _show_discovered(result: dict[str, Any], problems: dict[str, DriverError]) -> None:
@@ -101,12 +102,15 @@ def _show_discovered(result: dict[str, Any], problems: dict[str, DriverError]) -
             print(f"  {row['remedy']}")
     if not result["places"]:
         print("no serial port and no CAN interface found; plug in an adapter and try again")
-    for where, problem in problems.items():
-        print(f"{where}: {problem}")
-    for amplifier in result["amplifiers"]:
+    for url, problem in problems.items():
+        print(f"{url}: {problem}")
+    amplifiers = result["amplifiers"]
+    for amplifier in amplifiers:
         print("  ".join(amplifier.values()))
-    reached = [amplifier["url"] for amplifier in result["amplifiers"]]
-    print(f"Next: era amp identify {shlex.quote(reached[0])}" if reached else "no amplifier found")
+    if amplifiers:
+        print(f"Next: era amp identify {shlex.quote(amplifiers[0]['url'])}")
+    else:
+        print("no amplifier found")
 
 
 @amp.command()
@@ -189,7 +193,7 @@ def clear(url: Url, trace: Trace = None, json_: Json = False) -> None:
 
 
 def run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:
-    """Run what talks to an amplifier, traced to a file if one is named; return its result."""
+    """Run a coroutine that uses an amplifier and return its result; trace: file for its frames."""
     import asyncio
 
     from drivers.trace import tracing
@@ -218,7 +222,7 @@ def _act(
     if json_:
         print(json.dumps(result))
         return result
-    rows = {k: value for k, value in result.items() if value not in (None, "")}
+    rows = {key: value for key, value in result.items() if value not in (None, "")}
     width = max(map(len, rows))
     for key, value in rows.items():
         print(f"{key:{width}}  {in_words(value)}")
@@ -233,13 +237,19 @@ def in_words(value: Any) -> str:
         case float():
             return f"{value:.5g}"
         case list():
-            between = "; " if any(isinstance(one, dict) for one in value) else ", "
-            return between.join(in_words(one) for one in value) or "none"
+            separator = "; " if any(isinstance(item, dict) for item in value) else ", "
+            return separator.join(map(in_words, value)) or "none"
         case dict():
-            words = {key: in_words(one) for key, one in value.items() if one is not None}
-            return ", ".join(
-                f"{key} ({text})" if isinstance(value[key], dict) else f"{key} {text}"
-                for key, text in words.items()
-            )
+            return _object_in_words(value)
         case _:
             return str(value)
+
+
+def _object_in_words(values: dict[str, Any]) -> str:
+    parts = []
+    for key, value in values.items():
+        if isinstance(value, dict):
+            parts.append(f"{key} ({in_words(value)})")
+        elif value is not None:
+            parts.append(f"{key} {in_words(value)}")
+    return ", ".join(parts)

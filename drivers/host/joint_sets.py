@@ -18,7 +18,7 @@ Mark makes all of them record the clock at the same byte.
 import asyncio
 import math
 import re
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
@@ -344,26 +344,47 @@ class JointSets:
             refusal = _merged(refusals)
             return await self._silenced(refusal, amplifiers, began) if is_now else refusal
         try:
-            # A worse failure of another amplifier is raised rather than a refusal.
-            others = [results[amplifier] for amplifier in results if amplifier.name not in refusals]
-            self._members.checked(others)
-            staged_sets = self._members.checked([*results.values()])
+            staged = self._staged(results, refusals)
         except Overtaken as overtaken:
             return overtaken
-        staged = dict(zip(amplifiers, staged_sets, strict=True))
         if is_preempted is not None and not is_now and is_preempted():
             return Overtaken(f"set {token} is preempted")
         if not is_now:
-            self._members.check_none_since(epoch)
-            self.is_incomplete = True
-            try:
-                await self._commit(staged)
-            except CommandRefused as refusal:
-                if refusal.until is None or self._members.epoch != epoch:
-                    raise
-                return await self._silenced(refusal, amplifiers, began)
+            late_refusal = await self._commit_after_staging(staged, epoch)
+            if late_refusal is not None:
+                return await self._silenced(late_refusal, amplifiers, began)
         self.is_incomplete = False
         return await self._played(token, staged)
+
+    def _staged(
+        self, results: Mapping[Amplifier, StagedSet | BaseException], refused: Collection[str]
+    ) -> dict[Amplifier, StagedSet]:
+        """Return the staged sets, or raise the failure of an amplifier.
+
+        refused: names of amplifiers whose ledger has refused its set. A worse failure of another
+        amplifier is raised first.
+        """
+        others = [result for amplifier, result in results.items() if amplifier.name not in refused]
+        self._members.checked(others)
+        staged_sets = self._members.checked([*results.values()])
+        return dict(zip(results, staged_sets, strict=True))
+
+    async def _commit_after_staging(
+        self, staged: Mapping[Amplifier, StagedSet], epoch: int
+    ) -> CommandRefused | None:
+        """Commit staged sets; return a refusal that is only due to lateness, raise others.
+
+        epoch: of the members before staging.
+        """
+        self._members.check_none_since(epoch)
+        self.is_incomplete = True
+        try:
+            await self._commit(staged)
+        except CommandRefused as refusal:
+            if refusal.until is None or self._members.epoch != epoch:
+                raise
+            return refusal
+        return None
 
     async def _played(self, token: int, staged: Mapping[Amplifier, StagedSet]) -> PlayedSet:
         """Return the set that was committed, after reading how amplifiers have rounded it."""
@@ -663,37 +684,36 @@ class Clocks:
         loop = asyncio.get_running_loop()
         now = loop.time()
         worst = 0.0
-        busy: dict[Line, float] = {}
-        unmarked: list[tuple[Line, Sequence[Amplifier]]] = []
+        unmarked: dict[Line, Sequence[Amplifier]] = {}
         for line, line_amplifiers in by_line.items():
-            busy[line] = 0.0
-            for amplifier in line_amplifiers:
-                last_round_trip = amplifier.counts.last_round_trip or 0.0
-                busy[line] += max(amplifier.exchange_time("GetStatus"), last_round_trip)
             if line in self._marked:
                 self._compare(line_amplifiers, now)
-                # A time of its own: what waits for a reply would go out in step with frames of USB.
-                later = self.later(_INTERVAL + busy[line])
-                loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
-                continue
-            unmarked.append((line, line_amplifiers))
-            for amplifier in line_amplifiers:
-                if amplifier.clock.can_be_steered:
-                    worst = max(worst, amplifier.clock.scatter(now))
+                # A Mark that waits for a reply would be sent in step with USB frames.
+                delay = self.later(_INTERVAL + _busy_time(line_amplifiers))
+                loop.call_later(delay, line.submit, None, Priority.HEARTBEAT, "Mark", {})
+            else:
+                unmarked[line] = line_amplifiers
+                worst = max(worst, _worst_scatter(line_amplifiers, now))
         if worst <= _GOOD:
             return
-        factor = 0.5
-        if worst <= _POOR:
-            factor = max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
-        min_interval = _INTERVAL * factor
-        for line, line_amplifiers in unmarked:
+        for line, line_amplifiers in unmarked.items():
             if line.late <= GRACE:
-                # Each at a time of its own: behind another's reply it would be in step with frames.
-                line_interval = max(min_interval, busy[line] / _MAX_LOAD)
-                interval = line_interval / len(line_amplifiers)
-                for number in range(1, int(HEARTBEAT / interval)):
-                    amplifier = next(self._turns[line])
-                    loop.call_later(self.later(number * interval), self.read_clock, amplifier)
+                self._schedule_readings(line, line_amplifiers, _reading_interval(worst))
+
+    def _schedule_readings(
+        self, line: Line, line_amplifiers: Sequence[Amplifier], min_interval: float
+    ) -> None:
+        """Schedule readings of a line's clocks until the next heartbeat.
+
+        min_interval: between readings of one clock [s], longer on a busy line. A reading that waits
+        for the reply to another one would be sent in step with USB frames.
+        """
+        loop = asyncio.get_running_loop()
+        line_interval = max(min_interval, _busy_time(line_amplifiers) / _MAX_LOAD)
+        interval = line_interval / len(line_amplifiers)
+        for number in range(1, int(HEARTBEAT / interval)):
+            amplifier = next(self._turns[line])
+            loop.call_later(self.later(number * interval), self.read_clock, amplifier)
 
     def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] plus a varying part of a frame."""
@@ -707,6 +727,31 @@ class Clocks:
         is_heard = amplifier.silence_cause is None and amplifier.line.loss is None
         if is_free and is_heard and not self._members.has_joint_set:
             self._readings[amplifier] = amplifier.read_status(Priority.READING)
+
+
+def _busy_time(line_amplifiers: Sequence[Amplifier]) -> float:
+    """Return how long heartbeats to all amplifiers of a line take [s]."""
+    busy = 0.0
+    for amplifier in line_amplifiers:
+        last_round_trip = amplifier.counts.last_round_trip or 0.0
+        busy += max(amplifier.exchange_time("GetStatus"), last_round_trip)
+    return busy
+
+
+def _worst_scatter(line_amplifiers: Sequence[Amplifier], now: float) -> float:
+    """Return the largest scatter [s] of the clocks that can be steered; 0 if there are none."""
+    worst = 0.0
+    for amplifier in line_amplifiers:
+        if amplifier.clock.can_be_steered:
+            worst = max(worst, amplifier.clock.scatter(now))
+    return worst
+
+
+def _reading_interval(scatter: float) -> float:
+    """Return the interval between readings of a clock with a scatter above _GOOD [s]."""
+    if scatter > _POOR:
+        return _INTERVAL / 2
+    return _INTERVAL * max((_FAIR - _GOOD) / (scatter - _GOOD), 1.0)
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:

@@ -420,29 +420,45 @@ class Ledger:
         sent_at, now: when the request for it went out, and when it came [s]. Levels of voices that
         change have only an upper bound, since it is not known exactly when they were committed.
         """
-        playback = self.playback
         late = sent_at - self.lag
         # Until then a status may show the set before.
         if sent_at < self._starts + self._start_error or late < self._advanced_to:
             return None
         self._advance(late)
-        levels = status["levels"]
-        tokens = status["tokens"]
-        if len(levels) != playback.channels:
-            return f"levels must be {playback.channels}, got {len(levels)}"
-        if len(tokens) != self.capabilities["layers"]:
-            return f"layers must be {self.capabilities['layers']}, got {len(tokens)}"
-        unsure_layers = {*self.may_be_silent}
+        channel_count = self.playback.channels
+        if len(status["levels"]) != channel_count:
+            return f"levels must be {channel_count}, got {len(status['levels'])}"
+        if len(status["tokens"]) != self.capabilities["layers"]:
+            return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
+        unsure_layers = self._unsure_layers(now)
+        token_problem = self._token_problem(status["tokens"], unsure_layers)
+        if token_problem is not None:
+            return token_problem
+        return self._level_problem(status["levels"], late, now, unsure_layers)
+
+    def _unsure_layers(self, now: float) -> set[int]:
+        """Return the layers that may or may not have changed by now [s]."""
         unsure_until = now + 2 * self.lag
-        if playback.changes_at <= unsure_until:  # some layer may or may not have changed yet
-            unsure_layers |= playback.unsure(unsure_until)
-        expected_tokens = playback.tokens
+        unsure_layers = {*self.may_be_silent}
+        if self.playback.changes_at <= unsure_until:
+            unsure_layers |= self.playback.unsure(unsure_until)
+        return unsure_layers
+
+    def _token_problem(self, tokens: Sequence[int], unsure_layers: set[int]) -> str | None:
+        """Describe the first wrong token of a layer; None if all agree."""
+        expected_tokens = self.playback.tokens
         for layer, token in enumerate(tokens):
             expected = expected_tokens.get(layer, 0)
             if token == expected:
                 continue
-            if layer not in unsure_layers or token not in playback.next_tokens(layer):
+            if layer not in unsure_layers or token not in self.playback.next_tokens(layer):
                 return f"token of layer {layer} must be {expected}, got {token}"
+        return None
+
+    def _level_problem(
+        self, levels: Sequence[int], late: float, now: float, unsure_layers: set[int]
+    ) -> str | None:
+        """Describe the first wrong level of a channel; None if all agree; see `_highest_level`."""
         tolerance = _STEPS * max(self.capabilities["level_step"], 1)
         for channel, level in enumerate(levels):
             max_level, is_settled = self._highest_level(channel, late, unsure_layers)
@@ -451,7 +467,7 @@ class Ledger:
                 continue
             low = 0
             if is_settled:
-                low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit)
+                low = round(min(self.playback.level(channel, now), 1.0) * _LEVEL.per_unit)
             if self._is_measured:
                 error = round(_MEASURING_ERROR * _LEVEL.per_unit)
                 low -= min(error, round(_WEAK * low))

@@ -49,41 +49,33 @@ SHORTENED_FADE: Final = 0.002
 NO_CHANNEL: Final = 255
 
 STATES: Mapping[str, int] = {
-    name: number
-    for number, name in enumerate(
-        (
-            "NOT_READY",
-            "SWITCH_ON_DISABLED",
-            "READY_TO_SWITCH_ON",
-            "SWITCHED_ON",
-            "OPERATION_ENABLED",
-            "QUICK_STOP_ACTIVE",
-            "FAULT_REACTION_ACTIVE",
-            "FAULT",
-        )
-    )
+    "NOT_READY": 0,
+    "SWITCH_ON_DISABLED": 1,
+    "READY_TO_SWITCH_ON": 2,
+    "SWITCHED_ON": 3,
+    "OPERATION_ENABLED": 4,
+    "QUICK_STOP_ACTIVE": 5,
+    "FAULT_REACTION_ACTIVE": 6,
+    "FAULT": 7,
 }
 ENABLED: Final = STATES["OPERATION_ENABLED"]
 """The state in which an amplifier plays: armed."""
-LATCHED: Final = tuple(
-    STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
+LATCHED: Final = (
+    STATES["QUICK_STOP_ACTIVE"],
+    STATES["FAULT_REACTION_ACTIVE"],
+    STATES["FAULT"],
 )
 """States that a stop or a fault leads to, until it is cleared."""
 FAULTS: Mapping[str, int] = {
-    name: number
-    for number, name in enumerate(
-        (
-            "NONE",
-            "WATCHDOG",
-            "OVER_TEMPERATURE",
-            "OVER_VOLTAGE",
-            "ARC",
-            "CHANNEL",
-            "INTERNAL",
-            "INTERLOCK",
-            "OVER_CURRENT",
-        )
-    )
+    "NONE": 0,
+    "WATCHDOG": 1,
+    "OVER_TEMPERATURE": 2,
+    "OVER_VOLTAGE": 3,
+    "ARC": 4,
+    "CHANNEL": 5,
+    "INTERNAL": 6,
+    "INTERLOCK": 7,
+    "OVER_CURRENT": 8,
 }
 REFUSALS: Mapping[str, int] = {
     "UNKNOWN_TYPE": 1,
@@ -114,9 +106,15 @@ FEATURES: Mapping[str, int] = {
 def _word(
     name: str, low: int, high: int, per_unit: int = 1, unit: str = "", zero: int = 0
 ) -> WireQuantity:
-    low, high = low + zero, high + zero
-    wire = "i16" if low < 0 else "u16" if high < 1 << 16 else "u32"
-    return WireQuantity(name, wire, per_unit, unit, low, high, name == "phase", zero)
+    """Return a quantity of the smallest type; low, high: before a shift by `zero` steps."""
+    minimum = low + zero
+    maximum = high + zero
+    wire = "u16"
+    if minimum < 0:
+        wire = "i16"
+    elif maximum >= WORD:
+        wire = "u32"
+    return WireQuantity(name, wire, per_unit, unit, minimum, maximum, name == "phase", zero)
 
 
 _QUANTITIES = (
@@ -155,14 +153,22 @@ _QUANTITIES = (
     _word("rate", -32768, 32767, 10000000),
     _word("clock_error", 0, 65535, 10000000, "s"),
 )
-QUANTITIES: dict[str, WireQuantity] = {each.name: each for each in _QUANTITIES}
+QUANTITIES: dict[str, WireQuantity] = {quantity.name: quantity for quantity in _QUANTITIES}
 """Quantities by name, including those of the readings below."""
 
 
 def _numbers(*names: str) -> tuple[Number, ...]:
-    """Fields by name; a name of another quantity is written name:quantity."""
-    split = (name.partition(":") for name in names)
-    return tuple(Number(name, QUANTITIES[quantity or name]) for name, _, quantity in split)
+    """Return fields by name; `name:quantity` if the quantity has another name."""
+    fields = []
+    for text in names:
+        name, _, quantity_name = text.partition(":")
+        fields.append(Number(name, QUANTITIES[quantity_name or name]))
+    return tuple(fields)
+
+
+def _record(*names: str) -> Record:
+    """Return a record of such fields."""
+    return Record(*_numbers(*names))
 
 
 def status_reading(
@@ -182,7 +188,8 @@ def status_reading(
     it. An added reading with a range from 0 or below is sent shifted to start at 1, because 0 means
     "not reported" there; raises ValueError if the shifted range exceeds a word.
     """
-    zero = 1 - low if is_added and low < 1 else 0
+    is_shifted = is_added and low < 1
+    zero = 1 - low if is_shifted else 0
     if high < WORD <= high + zero:
         raise ValueError(
             f"{name} must be from {low} to {WORD - 1 - zero}, or from 1 on, to be one word, where "
@@ -191,9 +198,9 @@ def status_reading(
     return Number(name, _word(name, low, high, per_unit, unit, zero), is_added, meaning, views)
 
 
-_TONES = Record(*_numbers("frequency", "level", "phase"))
-KNOT = Record(*_numbers("level", "phase"))
-ENVELOPE = Record(*_numbers("knots", "step:envelope_step"))
+_TONES = _record("frequency", "level", "phase")
+KNOT = _record("level", "phase")
+ENVELOPE = _record("knots", "step:envelope_step")
 COMMAND = Record(
     Bits((("channel", 4), ("keep_phase", 1), ("skip_ending", 1), ("onset", 1), ("ending", 1))),
     *_TONES.fields,
@@ -203,7 +210,7 @@ LAYER = Record(
     *_numbers("ramp", "valid_for"),
 )
 
-_LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
+_LIMITS = _record("frequency_min:frequency", "frequency_max:frequency", "level_max:level")
 STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
     status_reading("temperature", "of the amplifier", -1000, 2000, 10, "°C", "status", "page"),
@@ -214,9 +221,9 @@ STATUS = Record(
     Numbers("tokens", "layers", QUANTITIES["played_token"]),
     # Later readings: reading(..., "status", "page", is_added=True), with the views that show it.
 )
-READINGS = [each for each in STATUS.fields if isinstance(each, Number) and each.meaning]
+READINGS = [field for field in STATUS.fields if isinstance(field, Number) and field.meaning]
 """Fields of Status with values in physical units."""
-QUANTITIES |= {each.name: each.quantity for each in READINGS}
+QUANTITIES |= {reading.name: reading.quantity for reading in READINGS}
 
 
 _CAPABILITIES = Record(
@@ -232,8 +239,13 @@ _TAKEN = Record(
     Bits((("exact", 1), ("staged", 1), ("played", 1))),
     *_numbers("missing:count"),
 )
-_FAULT = Record(*_numbers("fault:code", "channel:code", "age"))
-_MEASURED = Record(*_numbers("channel_voltage", "channel_current"))
+_FAULT = _record("fault:code", "channel:code", "age")
+_FAULTS = Record(*_numbers("count"), Rows("faults", "count", _FAULT))
+_MEASURED_CHANNEL = _record("channel_voltage", "channel_current")
+_MEASURED = Record(*_numbers("count"), Rows("channels", "count", _MEASURED_CHANNEL))
+_ACHIEVED = Record(
+    *_numbers("token:played_token"), *LAYER.fields, Rows("commands", "count", COMMAND)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,74 +262,59 @@ class Message:
 
 EVENT: Final = 30
 NAK: Final = 31
-EVENT_RECORD = Record(*_numbers("state:code", "fault:code", "channel:code", "latch"))
-NAK_RECORD = Record(*_numbers("request:code", "code", "channel:code"))
+EVENT_RECORD = _record("state:code", "fault:code", "channel:code", "latch")
+NAK_RECORD = _record("request:code", "code", "channel:code")
 IDENTITY = Record(
-    *_numbers("versions:flags"), *map(Text, ("vendor", "product", "serial_number", "firmware"))
+    *_numbers("versions:flags"),
+    Text("vendor"),
+    Text("product"),
+    Text("serial_number"),
+    Text("firmware"),
 )
 """The identity in CAN objects and Modbus registers; a serial Hello keeps the bytes of version 2."""
 TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
 """The texts of an identity, in their order."""
 
 
+_NOTHING = Record()
+_ARM = _record("session", "watchdog", "shift")
+_SET = Record(
+    *_numbers("session", "token"),
+    Bits((("index", 8), ("parts", 7), ("now", 1))),
+    Rest("stream"),
+)
+_COMMIT = _record("session", "token", "at")
+_ANY_RAMP = _record("ramp:any_ramp")
+"""A ramp above the maximum counts as the maximum: nothing keeps an amplifier from silence."""
+_SET_ADDRESS = Record(*_numbers("address"), Text("serial_number"))
+
 _MESSAGES = (
-    Message("GetCaps", 2, Record(), _CAPABILITIES),
-    Message("Arm", 3, Record(*_numbers("session", "watchdog", "shift")), STATUS, feeds=True),
-    # A ramp above the maximum counts as the maximum: nothing keeps an amplifier from silence.
-    Message("Disarm", 4, Record(*_numbers("ramp:any_ramp")), STATUS),
-    Message(
-        "Set",
-        5,
-        Record(
-            *_numbers("session", "token"),
-            Bits((("index", 8), ("parts", 7), ("now", 1))),
-            Rest("stream"),
-        ),
-        _TAKEN,
-        feeds=True,
-    ),
-    Message(
-        "Commit",
-        6,
-        Record(*_numbers("session", "token", "at")),
-        STATUS,
-        is_broadcast=True,
-        feeds=True,
-    ),
-    Message("Silence", 7, Record(*_numbers("session", "ramp")), STATUS, feeds=True),
-    Message("Stop", 8, Record(*_numbers("ramp:any_ramp")), STATUS, is_broadcast=True),
-    Message("GetStatus", 9, Record(), STATUS),
-    Message("GetFaults", 10, Record(), Record(*_numbers("count"), Rows("faults", "count", _FAULT))),
-    Message("Clear", 11, Record(*_numbers("latch")), STATUS),
-    Message("Ping", 12, Record(*_numbers("session", "rate")), STATUS, feeds=True),
-    Message(
-        "GetAchieved",
-        13,
-        Record(*_numbers("layer")),
-        Record(*_numbers("token:played_token"), *LAYER.fields, Rows("commands", "count", COMMAND)),
-    ),
-    Message(
-        "GetMeasured",
-        14,
-        Record(),
-        Record(*_numbers("count"), Rows("channels", "count", _MEASURED)),
-    ),
-    Message(
-        "SetAddress",
-        15,
-        Record(*_numbers("address"), Text("serial_number")),
-        STATUS,
-        is_broadcast=True,
-    ),
-    Message("Mark", 19, Record(), STATUS, is_broadcast=True),
+    Message("GetCaps", 2, _NOTHING, _CAPABILITIES),
+    Message("Arm", 3, _ARM, STATUS, feeds=True),
+    Message("Disarm", 4, _ANY_RAMP, STATUS),
+    Message("Set", 5, _SET, _TAKEN, feeds=True),
+    Message("Commit", 6, _COMMIT, STATUS, is_broadcast=True, feeds=True),
+    Message("Silence", 7, _record("session", "ramp"), STATUS, feeds=True),
+    Message("Stop", 8, _ANY_RAMP, STATUS, is_broadcast=True),
+    Message("GetStatus", 9, _NOTHING, STATUS),
+    Message("GetFaults", 10, _NOTHING, _FAULTS),
+    Message("Clear", 11, _record("latch"), STATUS),
+    Message("Ping", 12, _record("session", "rate"), STATUS, feeds=True),
+    Message("GetAchieved", 13, _record("layer"), _ACHIEVED),
+    Message("GetMeasured", 14, _NOTHING, _MEASURED),
+    Message("SetAddress", 15, _SET_ADDRESS, STATUS, is_broadcast=True),
+    Message("Mark", 19, _NOTHING, STATUS, is_broadcast=True),
 )
 MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
 RESERVED_MESSAGES: Final = (16, 17, 18)
 """Numbers of former messages, with feature bit 5; must not be reused."""
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
-REQUESTS: Mapping[str, Message] = {"Hello": Message("Hello", HELLO, Record(), IDENTITY), **MESSAGES}
+REQUESTS: Mapping[str, Message] = {
+    "Hello": Message("Hello", HELLO, _NOTHING, IDENTITY),
+    **MESSAGES,
+}
 """Requests by name: Hello, common to all versions, and the requests of this version."""
-REQUEST_NAMES: Mapping[int, str] = {each.number: name for name, each in REQUESTS.items()}
+REQUEST_NAMES: Mapping[int, str] = {message.number: name for name, message in REQUESTS.items()}
 """Names of requests by number."""
 
 
@@ -332,16 +329,19 @@ def decode_request(number: int, words: Sequence[int]) -> tuple[str, Values]:
 def nak_of(refusal: Refusal, number: int) -> list[int]:
     """Return the words of the Nak to a request with a message's number."""
     channel = NO_CHANNEL if refusal.channel is None else refusal.channel
-    return NAK_RECORD.pack({"request": number, "code": REFUSALS[refusal.code], "channel": channel})
+    code = REFUSALS[refusal.code]
+    return NAK_RECORD.pack({"request": number, "code": code, "channel": channel})
 
 
-def capability_ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
+def capability_ranges(capabilities: Values) -> Iterator[tuple[str, int, int, int]]:
     """Yield name, minimum, value and maximum of capabilities with additional bounds."""
+    largest = WORD - 1
     for name in ("frequency_step", "level_step", "phase_step", "level_max"):
-        yield name, 1, can[name], WORD - 1
-    yield "voices", can["layers"], can["voices"], WORD - 1
-    for name in ("frequency", "watchdog", "envelope_step"):
-        yield f"{name}_max", can[f"{name}_min"], can[f"{name}_max"], WORD - 1
+        yield name, 1, capabilities[name], largest
+    yield "voices", capabilities["layers"], capabilities["voices"], largest
+    for quantity in ("frequency", "watchdog", "envelope_step"):
+        name = f"{quantity}_max"
+        yield name, capabilities[f"{quantity}_min"], capabilities[name], largest
 
 
 def has_feature(capabilities: Values, name: str) -> bool:
@@ -355,8 +355,11 @@ def has_flag(status: Values, name: str) -> bool:
 
 
 def name_of(names: Mapping[str, int], number: int) -> str:
-    """Return the name of a number of the table, or the number."""
-    return next((name for name, each in names.items() if each == number), str(number))
+    """Return the name of a number in a table, or the number."""
+    for name, named_number in names.items():
+        if named_number == number:
+            return name
+    return str(number)
 
 
 SPAN = 1 << 32
@@ -378,7 +381,9 @@ def clock_at(seconds: float) -> int:
 
 def ahead(clock: int, of: int) -> float:
     """Return by how much [s] a clock is ahead of another, at most half a turn either way."""
-    return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
+    half_turn = SPAN // 2
+    steps = (clock - of + half_turn) % SPAN - half_turn
+    return steps / _PER_SECOND
 
 
 def word_passed(seconds: float) -> int:
@@ -391,7 +396,8 @@ def word_passed(seconds: float) -> int:
 
 def moment_behind(seconds: float) -> float:
     """Return when [s] a clock of `clock_at` next begins a high word, from a time [s] on."""
-    return seconds + (-clock_at(seconds) % HIGH_STEPS) / _PER_SECOND
+    steps_left = -clock_at(seconds) % HIGH_STEPS
+    return seconds + steps_left / _PER_SECOND
 
 
 def moment_of(at: int, seconds: float) -> float | None:
@@ -399,9 +405,10 @@ def moment_of(at: int, seconds: float) -> float | None:
 
     at: the high word of a clock of `clock_at`.
     """
-    now = clock_at(seconds)
-    left = (at * HIGH_STEPS - now) % SPAN
-    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
+    steps_left = (at * HIGH_STEPS - clock_at(seconds)) % SPAN
+    if not 0 < steps_left <= AHEAD_MAX * HIGH_STEPS:
+        return None
+    return seconds + steps_left / _PER_SECOND
 
 
 def high_word(clock: int) -> int:

@@ -199,6 +199,16 @@ class Bits:
     parts: tuple[tuple[str, int], ...]
     words = 1
 
+    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
+        """Read the numbers."""
+        word = words[at]
+        for name, bits in reversed(self.parts):
+            values[name] = word & (1 << bits) - 1
+            word >>= bits
+        if word:
+            raise Refusal(f"unused bits next to {self.parts[0][0]} must be 0")
+        return at + 1
+
     @property
     def shifts(self) -> list[int]:
         """By how much each is shifted."""
@@ -259,6 +269,18 @@ class Numbers:
             if not low <= number <= high:
                 raise ValueError(_out_of_range(self.name, self.quantity, number))
         words.extend(numbers)
+
+    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
+        """Read the integers."""
+        end = at + int(values[self.count])
+        if end > len(words):
+            raise IndexError
+        numbers = list(words[at:end])
+        for number in numbers:
+            if not self.quantity.minimum <= number <= self.quantity.maximum:
+                raise Refusal(_out_of_range(self.name, self.quantity, number))
+        values[self.name] = numbers
+        return end
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,37 +406,20 @@ class Record:
             words = [*words, *self._unstated]
         try:
             for field in self.fields:
-                if isinstance(field, Number):
-                    quantity, word = field.quantity, words[at]
+                if isinstance(field, Number):  # nearly all; read without a call
+                    quantity = field.quantity
+                    word = words[at]
                     if quantity.wire == "u32":
                         at += 1
                         word = word * WORD + words[at]
                     elif quantity.minimum < 0 and word >= WORD // 2:
                         word -= WORD
-                    if not quantity.minimum <= word <= quantity.maximum and (
-                        word or not field.is_added
-                    ):
+                    is_unstated = field.is_added and not word
+                    if not is_unstated and not quantity.minimum <= word <= quantity.maximum:
                         code = _CODES.get(quantity.name, "BAD_VALUE")
                         raise Refusal(_out_of_range(field.name, quantity, word), code)
-                    values[field.name] = word or None if field.is_added else word
+                    values[field.name] = None if is_unstated else word
                     at += 1
-                elif isinstance(field, Bits):
-                    word = words[at]
-                    for name, bits in reversed(field.parts):
-                        values[name] = word & (1 << bits) - 1
-                        word >>= bits
-                    if word:
-                        raise Refusal(f"unused bits next to {field.parts[0][0]} must be 0")
-                    at += 1
-                elif isinstance(field, Numbers):
-                    quantity, end = field.quantity, at + int(values[field.count])
-                    if end > len(words):
-                        raise IndexError
-                    numbers = values[field.name] = list(words[at:end])
-                    for number in numbers:
-                        if not quantity.minimum <= number <= quantity.maximum:
-                            raise Refusal(_out_of_range(field.name, quantity, number))
-                    at = end
                 else:
                     at = field.unpack(words, at, values)
         except IndexError:

@@ -21,7 +21,7 @@ _FRAME_BITS = 47 + 8 * BLOCK
 _STUFFED_MAX = (33 + 8 * BLOCK) // 4  # one stuff bit per four at worst
 
 ERROR_ID: Final = 0x800
-"""Above all frame identifiers: a report of the adapter, with its code as data."""
+"""Identifier, above those of frames, of an adapter's error report; the data are its code."""
 BITRATE: Final = 500_000
 """Default bit rate of a bus [bit/s]."""
 
@@ -46,7 +46,7 @@ CANOPEN: Mapping[str, Any] = {
         "reset_communication": 130,
     },
     "nmt_states": {"BOOT_UP": 0, "STOPPED": 4, "OPERATIONAL": 5, "PRE_OPERATIONAL": 127},
-    "emergencies": {  # of each fault
+    "emergencies": {  # by fault
         "NONE": {"code": 0x0000, "error_register": 0x00},
         "WATCHDOG": {"code": 0x8130, "error_register": 0x11},
         "OVER_TEMPERATURE": {"code": 0x4310, "error_register": 0x09},
@@ -83,20 +83,21 @@ def cob_id(kind: str, node: int = 0) -> int:
 
 
 def frame_time(bitrate: int) -> float:
-    """Return how long a frame of eight bytes takes [s], with its pause, stuffed at worst."""
+    """Return the duration of a frame of eight bytes [s], with its pause and the most stuff bits."""
     return (_FRAME_BITS + _STUFFED_MAX) / bitrate
 
 
 REQUEST = 0x200
-"""Identifier of requests; the node is added, none for a broadcast."""
+"""Identifier of requests; the node is added (0 for a broadcast)."""
 REPLY = 0x180
 """Identifier of replies and events; the node is added."""
 NODE_MAX = 127
 NUMBER_MAX = 255
-"""The sequence number before 1."""
+"""The highest sequence number; 1 follows it."""
 LIFE = 0.1
 """Time without a frame [s] after which an incomplete message and the last number are forgotten."""
-_FIRST, _EACH = 2, 3  # words
+_FIRST_WORDS = 2  # in frame 0
+_NEXT_WORDS = 3  # in every other frame
 _PACKED = struct.Struct("<HB8s")
 
 
@@ -110,19 +111,21 @@ class CanMessage(NamedTuple):
 
 def frames_of(words: int) -> int:
     """Return how many frames a message of this many words has."""
-    return 1 + -(-max(words - _FIRST, 0) // _EACH)
+    further_words = max(words - _FIRST_WORDS, 0)
+    return 1 + math.ceil(further_words / _NEXT_WORDS)
 
 
 def segments(number: int, kind: int, words: Sequence[int]) -> list[bytes]:
     """Return the data of the frames of a message of a type."""
     count = frames_of(len(words))
-    padded = [*words, *[0] * (_FIRST + _EACH * (count - 1) - len(words))]
-    first = struct.pack("<BBBB2H", number, 0, kind, len(words), *padded[:_FIRST])
-    rest = (
-        struct.pack("<BB3H", number, index, *padded[_EACH * index - 1 : _EACH * index + 2])
-        for index in range(1, count)
-    )
-    return [first, *rest]
+    capacity = _FIRST_WORDS + _NEXT_WORDS * (count - 1)
+    padded = [*words, *[0] * (capacity - len(words))]
+    frames = [struct.pack("<BBBB2H", number, 0, kind, len(words), *padded[:_FIRST_WORDS])]
+    for index in range(1, count):
+        start = _FIRST_WORDS + _NEXT_WORDS * (index - 1)
+        frame_words = padded[start : start + _NEXT_WORDS]
+        frames.append(struct.pack("<BB3H", number, index, *frame_words))
+    return frames
 
 
 def pack_frames(frames: Iterable[CanFrame]) -> bytes:
@@ -143,8 +146,8 @@ class Assembler:
     Two different frames at the same index come from two senders: the message is discarded.
     Discarded messages count as unexpected, by their frame 0.
 
-    began: when the first frame of the last message came [s]; given_up: number and begin of a
-    message that another one ended before it was whole, until that is taken.
+    began: when the first frame of the last message came [s]; given_up: number and begin of an
+    incomplete message that the present one has replaced, until a reader resets it.
     """
 
     def __init__(self, counters: WireCounters, *, is_numbered: bool = True) -> None:
@@ -153,7 +156,8 @@ class Assembler:
         self._number = 0
         self._frames: dict[int, bytes] = {}
         self._is_ended = True
-        self._heard = self.began = -math.inf
+        self._heard = -math.inf
+        self.began = -math.inf
         self.given_up: tuple[int, float] | None = None
 
     def add(self, data: bytes, now: float) -> CanMessage | None:
@@ -166,7 +170,9 @@ class Assembler:
         if self._begins(data, now):
             self.given_up = None if self._is_ended else (self._number, self.began)
             self.began = now
-            self._number, self._frames, self._is_ended = data[0], {}, False
+            self._number = data[0]
+            self._frames = {}
+            self._is_ended = False
         elif self._is_ended or data[0] != self._number:
             self._counters.unexpected_frames += index == 0
             return None
@@ -179,16 +185,18 @@ class Assembler:
 
     def contradicts(self, data: bytes) -> bool:
         """Whether a frame's data differ from an earlier frame of the same number and index."""
-        known = self._frames.get(data[1]) if len(data) == BLOCK else None
-        return known is not None and known[0] == data[0] and known != data
+        earlier = self._frames.get(data[1]) if len(data) == BLOCK else None
+        return earlier is not None and earlier[0] == data[0] and earlier != data
 
     def _is_frame(self, data: bytes) -> bool:
         if len(data) != BLOCK or bool(data[0]) is not self._is_numbered:
             return False
-        return data[3] <= MAX_WORDS if data[1] == 0 else data[1] < frames_of(MAX_WORDS)
+        if data[1] == 0:
+            return data[3] <= MAX_WORDS
+        return data[1] < frames_of(MAX_WORDS)
 
     def _begins(self, data: bytes, now: float) -> bool:
-        """Whether a frame is the first that comes of a message."""
+        """Whether a frame is the first received frame of a message."""
         if not self._is_numbered:
             return data[1] == 0
         if self._number == 0 or now - self._heard > LIFE:
@@ -198,13 +206,15 @@ class Assembler:
     def _whole(self) -> CanMessage | None:
         if 0 not in self._frames:
             return None
-        head = self._frames[0]
-        count = frames_of(head[3])
+        first = self._frames[0]
+        kind = first[2]
+        word_count = first[3]
+        count = frames_of(word_count)
         if any(index not in self._frames for index in range(count)):
             return None
         self._is_ended = True
-        body = head[4:] + b"".join(self._frames[index][2:] for index in range(1, count))
-        return CanMessage(self._number, head[2], struct.unpack_from(f"<{head[3]}H", body))
+        body = first[4:] + b"".join(self._frames[index][2:] for index in range(1, count))
+        return CanMessage(self._number, kind, struct.unpack_from(f"<{word_count}H", body))
 
 
 _MAX_LENGTH = 512  # characters without a terminator; ten times the longest frame
@@ -238,10 +248,10 @@ def _slcan_line(frame: CanFrame) -> bytes:
 
 
 def _of_slcan_line(line: bytes) -> CanFrame | None:
-    found = _LINE.fullmatch(line)
-    if found is None:
+    match = _LINE.fullmatch(line)
+    if match is None:
         return None
-    identifier, length, digits = found.groups()
+    identifier, length, digits = match.groups()
     count = 2 * int(length)
     if len(digits) not in (count, count + _STAMP):
         return None
@@ -253,15 +263,17 @@ def _element(frame: CanFrame) -> bytes:
 
 
 def _of_element(element: bytes) -> CanFrame | None:
-    found = _HEARD.fullmatch(element, max(element.rfind(b"<"), 0))
-    return None if found is None else _frame(*found.groups())
+    match = _HEARD.fullmatch(element, max(element.rfind(b"<"), 0))
+    return None if match is None else _frame(*match.groups())
 
 
 def _of_sent(element: bytes) -> CanFrame | None:
-    found = _SENT.fullmatch(element, max(element.rfind(b"<"), 0))
-    if found is None or len(found[3].split()) != int(found[2]):
+    match = _SENT.fullmatch(element, max(element.rfind(b"<"), 0))
+    if match is None:
         return None
-    return CanFrame(int(found[1], 16), bytes(int(byte, 16) for byte in found[3].split()))
+    identifier, length, digits = match.groups()
+    data = bytes(int(byte, 16) for byte in digits.split())
+    return CanFrame(int(identifier, 16), data) if len(data) == int(length) else None
 
 
 def _frame(identifier: bytes, digits: bytes) -> CanFrame | None:
@@ -279,7 +291,8 @@ class TextReader:
     def __init__(
         self, form: TextFormat, on_other: Callable[[bytes], None] = lambda text: None
     ) -> None:
-        self._form, self._on_other = form, on_other
+        self._form = form
+        self._on_other = on_other
         self.rest = b""
         """Possible beginning of a text."""
 

@@ -35,6 +35,7 @@ from drivers.wires.modbus_frames import (
     TCP,
     WRITE,
     WRITE_SIZE,
+    Adu,
     AduReader,
     Pdu,
     Read,
@@ -72,7 +73,9 @@ class SilentPort(PortAbove):
     """
 
     def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
-        self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
+        self._silence = silence
+        self._byte_time = byte_time
+        self._on_data = on_data
         self._loop = asyncio.get_running_loop()
         self._free_from = self._loop.time() + silence
         self._sent_until = 0.0  # s; the end of the last frame of this port and its silence
@@ -82,8 +85,8 @@ class SilentPort(PortAbove):
     def write(self, data: bytes) -> None:
         """Send a frame as soon as the line has been silent; raises LinkError."""
         latest = self._loop.time() + RTU_MAX * self._byte_time + self._silence
-        kept = [each for each in self._waiting if each[1].startswith(_TO_ALL)]
-        self._waiting = [*kept, (latest, data)]
+        broadcasts = [entry for entry in self._waiting if entry[1].startswith(_TO_ALL)]
+        self._waiting = [*broadcasts, (latest, data)]
         self._send()
 
     def close(self) -> None:
@@ -172,12 +175,12 @@ class ModbusWire(Wire):
         if address == BROADCAST:
             if self._is_rtu:
                 return self._written(BROADCAST, name, values).frame
-            sent = [self._written(unit, name, values) for unit in self._sizes]
-            self._unawaited.update(adu.pdu.transaction_id for adu in sent)
-            if self._baud and sent:  # a gateway sends each write after the reply to the last one
+            writes = [self._written(unit, name, values) for unit in self._sizes]
+            self._unawaited.update(write.pdu.transaction_id for write in writes)
+            if self._baud and writes:  # a gateway sends each write after the reply to the last one
                 echo = self._time(ECHO_SIZE) + self.silence + REACTION
-                self.takes += (len(sent) - 1) * (self.takes + echo)
-            return b"".join(adu.frame for adu in sent)
+                self.takes += (len(writes) - 1) * (self.takes + echo)
+            return b"".join(write.frame for write in writes)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
             pdu = Read(dev_id=address, address=IDENTITY_REGISTER, count=IDENTITY_COUNT)
@@ -192,7 +195,8 @@ class ModbusWire(Wire):
     def _without_pause(self, write: _Request) -> bytes:
         """Return the frames of a part of a set over a network; the last part includes its read."""
         if write.has_reply:
-            self._write, self._request = write, self._read_of(write)
+            self._write = write
+            self._request = self._read_of(write)
             return write.frame + self._request.frame
         self._request = None
         self._unawaited.add(write.pdu.transaction_id)
@@ -200,17 +204,18 @@ class ModbusWire(Wire):
 
     def _read_of(self, write: _Request) -> _Request:
         """Return the request that reads the reply to a written one."""
-        unit, message = write.pdu.dev_id, write.message
+        unit = write.pdu.dev_id
+        message = write.message
         first = message.number * BOX + REPLY_OFFSET
-        count = HEAD + reply_words(message.name, *self._sizes[unit])
+        channels, layers = self._sizes[unit]
+        count = HEAD + reply_words(message.name, channels, layers)
         return self._sent(message, write.tag, Read(dev_id=unit, address=first, count=count))
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return the arrivals that these bytes complete."""
         request = self._request or self._last
-        sent = None if request is None else request.pdu
         arrivals: list[Arrival] = []
-        for adu in self._reader.feed(data, sent):
+        for adu in self._reader.feed(data, None if request is None else request.pdu):
             if not adu.pdu:
                 self._count_damaged(adu.raw)
                 continue
@@ -219,36 +224,58 @@ class ModbusWire(Wire):
             if adu.transaction in self._unawaited:
                 self._unawaited.remove(adu.transaction)
                 continue
-            write = self._write
-            if write is not None and (response := response_to(write.pdu, adu)) is not None:
-                self._write = None
-                if response.exception and (arrival := self._arrival(write, response)):
-                    arrivals.append(arrival)
-                continue
-            response = response_to(sent, adu)
-            if request is None or response is None:
-                self.counters.unexpected_frames += 1
-                number = "" if self._is_rtu else f"transaction {adu.transaction}, "
-                self.counters.remark = (
-                    f"a response of {number}unit {adu.unit} and function {adu.pdu[0]} came that is "
-                    "not of this request: check the unit, that a gateway repeats unit and "
-                    "transaction, and that nothing delays responses"
-                )
-            elif self._request is not request:  # a second response
-                self.counters.unexpected_frames += 1
-                if self._last is request and self._replied != response:
-                    arrivals.append(DuplicateAddress(adu.unit))
-            elif request.pdu.function_code == WRITE and not response.exception:
-                if request.has_reply:
-                    self._request = self._read_of(request)
-                    is_present = request.message.name in PRESENT
-                    arrivals.append(Continuation(self._request.frame, is_present=is_present))
-                else:
-                    self._request, self._last, self._replied = None, request, response
-                    arrivals.append(WrittenPart())
-            elif (arrival := self._arrival(request, response)) is not None:
+            arrival = self._arrival_in(adu, request)
+            if arrival is not None:
                 arrivals.append(arrival)
         return arrivals
+
+    def _arrival_in(self, adu: Adu, request: _Request | None) -> Arrival | None:
+        """Return the arrival in a valid ADU; None: ignore it.
+
+        request: on the wire, or else the last one, when the bytes came.
+        """
+        write = self._write
+        if write is not None:
+            response = response_to(write.pdu, adu)
+            if response is not None:
+                self._write = None
+                return self._arrival(write, response) if response.exception else None
+        response = None if request is None else response_to(request.pdu, adu)
+        if request is None or response is None:
+            self._count_unexpected(adu)
+            return None
+        if self._request is not request:  # a second response
+            self.counters.unexpected_frames += 1
+            is_other = self._last is request and self._replied != response
+            return DuplicateAddress(adu.unit) if is_other else None
+        if request.pdu.function_code == WRITE and not response.exception:
+            return self._written_arrival(request, response)
+        return self._arrival(request, response)
+
+    def _written_arrival(self, request: _Request, response: Response) -> Arrival:
+        """Return the arrival after a confirmed write: its read, or the end of a part of a set."""
+        if request.has_reply:
+            self._request = self._read_of(request)
+            is_present = request.message.name in PRESENT
+            return Continuation(self._request.frame, is_present=is_present)
+        self._finish(request, response)
+        return WrittenPart()
+
+    def _finish(self, request: _Request, response: Response) -> None:
+        """Take the request off the wire, and keep it and its response for comparison."""
+        self._request = None
+        self._last = request
+        self._replied = response
+
+    def _count_unexpected(self, adu: Adu) -> None:
+        """Count a response to no request on the wire."""
+        self.counters.unexpected_frames += 1
+        number = "" if self._is_rtu else f"transaction {adu.transaction}, "
+        self.counters.remark = (
+            f"a response of {number}unit {adu.unit} and function {adu.pdu[0]} came that is "
+            "not of this request: check the unit, that a gateway repeats unit and "
+            "transaction, and that nothing delays responses"
+        )
 
     def withdraw(self) -> None:
         """Give up the request on the wire, so that its reply will count as unexpected."""
@@ -266,8 +293,8 @@ class ModbusWire(Wire):
 
         They are two transactions, with a silence before each of the four frames; 0 over a network.
         """
-        rest = self._time(ECHO_SIZE + READ_SIZE + RESPONSE_SIZE + 2 * (HEAD + reply))
-        return self.transit(words) + rest + 3 * self.silence
+        after_write = self._time(ECHO_SIZE + READ_SIZE + RESPONSE_SIZE + 2 * (HEAD + reply))
+        return self.transit(words) + after_write + 3 * self.silence
 
     def _time(self, characters: int) -> float:
         return _BITS * characters / self._baud if self._baud else 0.0
@@ -301,15 +328,17 @@ class ModbusWire(Wire):
         self.counters.invalid_frames += not self._damaged
         self._damaged_size = len(data) + (self._damaged_size if self._damaged else 0)
         self._damaged = (self._damaged + data[: RTU_MAX + 5])[: RTU_MAX + 5]
-        what = f"{self._damaged_size} bytes that are no valid frame came "
-        what += f"({self._damaged[:8].hex(' ')})"
+        first_bytes = self._damaged[:8].hex(" ")
+        symptom = f"{self._damaged_size} bytes that are no valid frame came ({first_bytes})"
         if self._request is not None and self._damaged == self._request.frame:
-            what = "the request itself came back, and nothing else"
-        self.counters.remark = f"{what}: check {_RTU_CHECKS if self._is_rtu else _TCP_CHECKS}"
+            symptom = "the request itself came back, and nothing else"
+        checks = _RTU_CHECKS if self._is_rtu else _TCP_CHECKS
+        self.counters.remark = f"{symptom}: check {checks}"
 
     def _arrival(self, request: _Request, response: Response) -> Arrival | None:
         """Interpret a response to the transaction on the wire; None: ignore it."""
-        unit, is_hello = request.pdu.dev_id, request.message.name == "Hello"
+        unit = request.pdu.dev_id
+        is_hello = request.message.name == "Hello"
         if response.exception in _GATEWAY:  # counts as no response
             self.counters.remark = (
                 f"the gateway has no {_GATEWAY[response.exception]} unit {unit} "
@@ -328,13 +357,15 @@ class ModbusWire(Wire):
             self.counters.remark = "a reply to another master came: stop that master"
             return None
         else:
-            self._request, self._last, self._replied = None, request, response
+            self._finish(request, response)
         try:
             arrival = read_reply(request.message, *reply_in(request.message.number, response))
         except Refusal as error:
             return BrokenReply(str(error))
         if request.message.name == "GetCaps" and isinstance(arrival, Reply):
-            self._sizes[unit] = arrival.values["channels"], arrival.values["layers"]
+            channels = arrival.values["channels"]
+            layers = arrival.values["layers"]
+            self._sizes[unit] = (channels, layers)
         return arrival
 
 
@@ -359,7 +390,8 @@ class ModbusAddress(WireAddress):
             parsed.require(
                 not parsed.number, f"unit must be given as /{parsed.number} behind the host"
             )
-            place, unit = parsed.server(port=_TCP_PORT), parsed.path.strip("/")
+            place = parsed.server(port=_TCP_PORT)
+            unit = parsed.path.strip("/")
         parity = parsed.options.get("parity", "even")
         parsed.require(
             parity in _PARITIES, f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}"

@@ -40,25 +40,43 @@ from drivers.protocol.records import TEXT_MAX, Refusal, Values
 # pymodbus logs Modbus exceptions as program errors; pymodbus_apply_logging_config shows its log.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
 
-READS, READ, WRITE = (3, 4), 4, 16
-"""Function codes that read registers, the one used by hosts, and the one that writes."""
+READS = (3, 4)
+"""Function codes that read registers."""
+READ = 4
+"""Function code with which hosts read."""
+WRITE = 16
+"""Function code with which hosts write."""
 EXCEPTION = 0x80
 """Bit of the function code that marks an exception response."""
-WRITE_SIZE, ECHO_SIZE, READ_SIZE, RESPONSE_SIZE = 9, 8, 8, 5
-"""Bytes on RTU of a write and its response, of a read and its response; registers not counted."""
+WRITE_SIZE = 9
+"""Bytes of a write on RTU without its registers."""
+ECHO_SIZE = 8
+"""Bytes of the response to a write on RTU."""
+READ_SIZE = 8
+"""Bytes of a read on RTU."""
+RESPONSE_SIZE = 5
+"""Bytes of the response to a read on RTU without its registers."""
 
-BOX, REPLY_OFFSET, HEAD = 256, 128, 2
-"""Registers of a message, offset of its reply, registers of that before its words."""
+BOX = 256
+"""Registers of a message."""
+REPLY_OFFSET = 128
+"""Offset of the reply within the registers of its message."""
+HEAD = 2
+"""Registers of a reply before its words: tag and result."""
 AREA = HEAD + MAX_WORDS
-"""Registers of a reply, with zeros behind it."""
-IDENTITY_REGISTER, IDENTITY_COUNT = 1065, 2 + len(TEXTS) * TEXT_MAX // 2
-"""First register of the identity (tag 0, versions, texts padded with zeros), and their number."""
+"""Registers of a reply, padded with zeros."""
+IDENTITY_REGISTER = 1065
+"""First register of the identity: tag 0, versions, texts padded with zeros."""
+IDENTITY_COUNT = 2 + len(TEXTS) * TEXT_MAX // 2
+"""Registers of the identity."""
 PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 """Messages whose reply is made at the time of reading, without a previous write."""
 EXCEPTIONS: Mapping[int, str] = {
-    **dict.fromkeys((1, 2), "UNKNOWN_TYPE"),
+    1: "UNKNOWN_TYPE",
+    2: "UNKNOWN_TYPE",
     3: "BAD_LENGTH",
-    **dict.fromkeys((5, 6), "BUSY"),
+    5: "BUSY",
+    6: "BUSY",
 }
 """Nak codes by Modbus exception."""
 
@@ -69,7 +87,8 @@ _TRIES_MAX = 512  # positions to search for a frame in one step; noise can be en
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
 _COUNT_MAX = {3: 125, 4: 125, WRITE: 123}  # registers by function
-_REQUESTS, _RESPONSES = DecodePDU(is_server=True), DecodePDU(is_server=False)
+_REQUESTS = DecodePDU(is_server=True)
+_RESPONSES = DecodePDU(is_server=False)
 _REQUEST_KINDS: Mapping[int, type[ModbusPDU]] = {
     3: ReadHoldingRegistersRequest,
     READ: ReadInputRegistersRequest,
@@ -81,12 +100,16 @@ _RESPONSE_KINDS: Mapping[int, type[ModbusPDU]] = {
     WRITE: WriteMultipleRegistersResponse,
 }
 
-RTU, TCP = FramerRTU(_RESPONSES), FramerSocket(_RESPONSES)
-"""pymodbus's framers, which make frames."""
+RTU = FramerRTU(_RESPONSES)
+"""pymodbus's encoder of RTU frames."""
+TCP = FramerSocket(_RESPONSES)
+"""pymodbus's encoder of TCP frames."""
 Pdu: TypeAlias = ModbusPDU
 """A request or a response: function_code, dev_id, transaction_id, address, count, registers."""
-Read, Write = ReadInputRegistersRequest, WriteMultipleRegistersRequest
-"""Requests of a host."""
+Read = ReadInputRegistersRequest
+"""A host's request that reads."""
+Write = WriteMultipleRegistersRequest
+"""A host's request that writes."""
 
 
 class Adu(NamedTuple):
@@ -142,17 +165,18 @@ def exception_to(function: int, code: int) -> bytes:
 
 def parse_request(adu: Adu) -> Pdu | None:
     """Return the request of an ADU that reads or writes registers; None for any other."""
-    pdu = adu.pdu
-    if pdu[0] not in _REQUEST_KINDS:
+    function = adu.pdu[0]
+    kind = _REQUEST_KINDS.get(function)
+    if kind is None:
         return None
-    request = _REQUEST_KINDS[pdu[0]](dev_id=adu.unit, transaction_id=adu.transaction)
+    request = kind(dev_id=adu.unit, transaction_id=adu.transaction)
     try:
-        request.decode(pdu[1:])
-        written = request.count if pdu[0] == WRITE else 0
-        is_whole = pdu_of(request) == pdu and len(request.registers) == written
-    except Exception:  # whatever a library raises for bytes that were damaged
+        request.decode(adu.pdu[1:])
+        register_count = request.count if function == WRITE else 0
+        is_whole = pdu_of(request) == adu.pdu and len(request.registers) == register_count
+    except Exception:  # pymodbus raises various exceptions for damaged bytes
         return None
-    return request if is_whole and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None
+    return request if is_whole and 1 <= request.count <= _COUNT_MAX[function] else None
 
 
 def message_written(request: Pdu) -> Message | None:
@@ -175,17 +199,20 @@ def response_to(request: Pdu | None, adu: Adu) -> Response | None:
     It has the unit, the transaction and the function of the request, and as many registers, or
     echoes address and count.
     """
-    unit, pdu, transaction, _ = adu
-    if request is None or (unit, transaction) != (request.dev_id, request.transaction_id):
+    if request is None or adu.unit != request.dev_id:
         return None
-    function, count = request.function_code, request.count
+    if adu.transaction != request.transaction_id:
+        return None
+    pdu = adu.pdu
+    function = request.function_code
     if pdu[0] == function | EXCEPTION:
         return Response(exception=pdu[1]) if len(pdu) == 2 and pdu[1] else None
     if function == WRITE:
         return Response() if pdu == response_pdu(request) else None
-    if pdu[:2] != bytes((function, 2 * count)) or len(pdu) != 2 + 2 * count:
+    size = 2 * request.count
+    if pdu[:2] != bytes((function, size)) or len(pdu) != 2 + size:
         return None
-    return Response(struct.unpack(f">{count}H", pdu[2:]))
+    return Response(struct.unpack(f">{request.count}H", pdu[2:]))
 
 
 def reply_in(number: int, response: Response) -> tuple[int, Sequence[int]]:
@@ -201,17 +228,20 @@ def reply_in(number: int, response: Response) -> tuple[int, Sequence[int]]:
     if number == HELLO:
         return HELLO, IDENTITY.pack(unpack_identity(response.registers))
     _, result, *words = response.registers
-    return (NAK, (number, *divmod(result, 256))) if result else (number, words)
+    if not result:
+        return number, words
+    code, channel = divmod(result, 256)
+    return NAK, (number, code, channel)
 
 
 class AduReader:
     """Splits a stream of requests or responses into ADUs; invalid bytes have no PDU.
 
-    Over TCP each header gives the start of the next. Over RTU a frame starts wherever the length
-    given in it leads to a valid CRC. Damaged bytes can look like a frame: an amplifier (waits) does
-    not search inside a frame that may become complete, or one with an unknown function, which ends
-    with a pause; a host (is_host) accepts only the awaited response after them. rest: a possible
-    beginning of a frame.
+    Over TCP each header gives the start of the next frame. Over RTU a frame starts at a byte from
+    which the length given in the frame leads to a valid CRC. Damaged bytes can look like a frame:
+    an amplifier (waits) does not search inside a frame that may become complete, or one with an
+    unknown function, which ends with a pause; a host (is_host) accepts only the awaited response
+    after them. rest: a possible beginning of a frame.
     """
 
     def __init__(
@@ -220,67 +250,96 @@ class AduReader:
         self.rest = b""
         self._is_rtu = is_rtu
         self._decoder = _REQUESTS if of_requests else _RESPONSES
-        self._waits, self._is_host = waits, is_host
-        self._is_lost = False  # behind damaged bytes
+        self._waits = waits
+        self._is_host = is_host
+        self._is_lost = False  # after damaged bytes
 
     def feed(self, data: bytes, request: Pdu | None = None) -> list[Adu]:
         """Return the ADUs that these bytes complete, in order; request: whose response is due."""
         data = self.rest + data
         if self._is_rtu:
             return self._split_rtu(data, request, waits=self._waits)
-        found: list[Adu] = []
+        return self._split_tcp(data)
+
+    def _split_tcp(self, data: bytes) -> list[Adu]:
+        adus: list[Adu] = []
         while len(data) >= _MBAP.size:
             transaction, protocol, length, unit = _MBAP.unpack_from(data)
             if protocol or not 2 <= length <= _LENGTH_MAX:  # the next frame cannot be found
                 self.rest = b""
-                return [*found, Adu(unit, b"", raw=data)]
-            if len(data) < (size := _MBAP.size - 1 + length):
+                return [*adus, Adu(unit, b"", raw=data)]
+            size = _MBAP.size - 1 + length
+            if len(data) < size:
                 break
-            found.append(Adu(unit, data[_MBAP.size : size], transaction, data[:size]))
+            adus.append(Adu(unit, data[_MBAP.size : size], transaction, data[:size]))
             data = data[size:]
         self.rest = data
-        return found
+        return adus
 
     def end(self) -> list[Adu]:
         """Return the ADUs of the rest, ended by a pause."""
-        data, found = self.rest, list[Adu]()
-        if self._is_rtu and data:
-            whole = checked_adu(data)
-            found = [whole] if whole else self._split_rtu(data, None, waits=False)
-            data = b"" if whole else self.rest
-        self.rest, self._is_lost = b"", False
-        return [*found, Adu(0, b"", raw=data)] if data else found
+        adus: list[Adu] = []
+        invalid = self.rest
+        if self._is_rtu and self.rest:
+            whole = checked_adu(self.rest)
+            if whole is not None:
+                adus = [whole]
+                invalid = b""
+            else:
+                adus = self._split_rtu(self.rest, None, waits=False)
+                invalid = self.rest
+        self.rest = b""
+        self._is_lost = False
+        if invalid:
+            adus.append(Adu(0, b"", raw=invalid))
+        return adus
 
     def _split_rtu(self, data: bytes, request: Pdu | None, *, waits: bool) -> list[Adu]:
-        found: list[Adu] = []
-        start, rest = 0, -1  # search position, and start of a possibly incomplete frame
+        adus: list[Adu] = []
+        start = 0  # search position
+        rest = -1  # start of a possibly incomplete frame
         tries = 0
         while start < len(data):
             size = self._size(data[start : start + RTU_MAX])
-            is_whole = 0 < size <= len(data) - start
-            adu = checked_adu(data[start : start + size]) if is_whole else None
-            is_behind = self._is_lost or start > 0
-            if adu and not (is_behind and self._is_host and response_to(request, adu) is None):
+            adu = self._adu_at(data, start, size, request)
+            if adu is not None:
                 if start:
-                    found.append(Adu(0, b"", raw=data[:start]))
-                found.append(adu)
-                data, start, rest, self._is_lost = data[start + size :], 0, -1, False
+                    adus.append(Adu(0, b"", raw=data[:start]))
+                adus.append(adu)
+                data = data[start + size :]
+                start = 0
+                rest = -1
+                self._is_lost = False
                 continue
             is_short = len(data) <= RTU_MAX
-            may_end = size == 0 and waits and not is_behind and is_short  # by a pause
+            may_wait = waits and is_short and start == 0 and not self._is_lost
+            may_end = size == 0 and may_wait  # by a pause
             if rest < 0 and (size > len(data) - start or may_end):
                 rest = start
-            if rest == start and waits and not is_behind and is_short:
+            if rest == start and may_wait:
                 break
-            start, tries = start + 1, tries + 1
+            start += 1
+            tries += 1
             if tries >= _TRIES_MAX:
                 start = max(start, len(data) - RTU_MAX)
-        rest = len(data) if rest < 0 else rest
-        if rest:
-            found.append(Adu(0, b"", raw=data[:rest]))
-            self._is_lost = True
-        self.rest = data[rest:]
-        return found
+        return [*adus, *self._keep_rest(data, len(data) if rest < 0 else rest)]
+
+    def _keep_rest(self, data: bytes, start: int) -> list[Adu]:
+        """Keep data from a position on for the next call; return the invalid bytes before it."""
+        self.rest = data[start:]
+        if start == 0:
+            return []
+        self._is_lost = True
+        return [Adu(0, b"", raw=data[:start])]
+
+    def _adu_at(self, data: bytes, start: int, size: int, request: Pdu | None) -> Adu | None:
+        """Return the valid frame of a size at a position; None if there is none to accept."""
+        is_whole = 0 < size <= len(data) - start
+        adu = checked_adu(data[start : start + size]) if is_whole else None
+        is_after_damage = self._is_lost or start > 0
+        if adu is not None and is_after_damage and self._is_host:
+            return adu if response_to(request, adu) is not None else None
+        return adu
 
     def _size(self, data: bytes) -> int:
         """Return the size of an RTU frame here; 0 if impossible, the maximum if unknown."""
@@ -289,13 +348,13 @@ class AduReader:
         try:
             kind = self._decoder.lookupPduClass(data)
             size = 0 if kind is None else kind.calculateRtuFrameSize(data) or RTU_MAX
-        except Exception:  # whatever a library raises for bytes that were damaged
+        except Exception:  # pymodbus raises various exceptions for damaged bytes
             return 0
         return size if size <= RTU_MAX else 0
 
 
 def checked_adu(frame: bytes) -> Adu | None:
-    """Return what an RTU frame holds if its CRC is valid, else None."""
+    """Return the ADU in an RTU frame, or None if its CRC is invalid."""
     if len(frame) < _RTU_MIN:
         return None
     if not FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big")):
@@ -314,6 +373,7 @@ def unpack_identity(registers: Sequence[int]) -> Values:
     raw = struct.pack(f">{len(registers)}H", *registers)
     identity: Values = {"versions": registers[1]}
     for number, field in enumerate(TEXTS):
-        text = raw[4 + number * TEXT_MAX :][:TEXT_MAX].rstrip(b"\0")
+        start = 4 + number * TEXT_MAX
+        text = raw[start : start + TEXT_MAX].rstrip(b"\0")
         field.read(text, len(text), identity)
     return identity

@@ -22,7 +22,7 @@ from drivers.protocol.records import Refusal
 
 REPLY_BIT = 0x80
 NEUTRAL = 0
-"""Version of what every version of the protocol has: Hello, its reply, and a refused version."""
+"""Version number in frames that all versions share: Hello, its reply, and a rejected version."""
 
 _TYPE_MASK = 0x7F
 _HEADER = struct.Struct("<BBBH")
@@ -59,12 +59,14 @@ class Frame(NamedTuple):
 
 def encode_frame(frame: Frame, words: Sequence[int] = ()) -> bytes:
     """Encode a frame with its delimiters, words behind its payload; ValueError for too many."""
-    kind, address, sequence, payload, version = frame
+    payload = frame.payload
     length = len(payload) + 2 * len(words)
     if length > PAYLOAD_MAX:
         raise ValueError(f"payload must have at most {PAYLOAD_MAX} bytes, got {length}")
     form = f"<BBBH{len(payload)}s{len(words)}H"
-    body = struct.pack(form, kind, version, address, sequence, payload, *words)
+    body = struct.pack(
+        form, frame.kind, frame.version, frame.address, frame.sequence, payload, *words
+    )
     stuffed: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
     return b"\0" + stuffed + b"\0"
 
@@ -92,15 +94,16 @@ class FrameReader:
         frames = []
         *ended, rest = (self.rest + data).split(b"\0")
         for piece in ended:
-            is_read = piece and not self._is_skipping  # a leading zero has nothing before it
+            is_skipped = self._is_skipping or not piece  # a leading zero ends an empty piece
             self._is_skipping = False
-            if not is_read:
+            if is_skipped:
                 continue
             try:
                 content = cobs.decode(piece) if len(piece) <= _STUFFED_MAX else b""
             except cobs.DecodeError:
                 content = b""
-            body, crc = content[: -_CRC.size], content[-_CRC.size :]
+            body = content[: -_CRC.size]
+            crc = content[-_CRC.size :]
             if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
                 self._on_invalid(piece[:_STUFFED_MAX])
                 continue
@@ -128,17 +131,21 @@ def unpack_words(payload: bytes) -> tuple[int, ...]:
 def words_of(frame: Frame) -> Sequence[int]:
     """Return the words of a frame; Refusal for half a word.
 
-    A Hello has none. Its reply has the words of its record, up to the end of its texts.
+    A Hello is empty. Its reply has the words of its record, up to the end of its texts.
     """
     if frame.kind == HELLO:
         return ()
     if frame.kind != HELLO | REPLY_BIT:
         return unpack_words(frame.payload)
-    words, rest = [int.from_bytes(frame.payload[:2], "little")], frame.payload[2:]
+    versions = int.from_bytes(frame.payload[:2], "little")
+    words = [versions]
+    texts = frame.payload[2:]
     for _ in TEXTS:
-        if rest:
-            length, raw, rest = rest[0], rest[1:][: rest[0]], rest[1 + rest[0] :]
-            padded = raw + b"\0" * (len(raw) % 2)
+        if texts:
+            length = texts[0]
+            text = texts[1 : 1 + length]
+            texts = texts[1 + length :]
+            padded = text + b"\0" * (len(text) % 2)
             words += [length, *struct.unpack(f">{len(padded) // 2}H", padded)]
     return words
 
@@ -147,9 +154,12 @@ def payload_of(kind: int, words: Sequence[int]) -> bytes:
     """Return the payload of words; in a reply to Hello each text begins with a byte, its length."""
     if kind != HELLO | REPLY_BIT:
         return pack_words(words)
-    payload, rest = pack_words(words[:1]), words[1:]
+    payload = pack_words(words[:1])
+    text_words = words[1:]
     for _ in TEXTS:
-        length, count = rest[0], (rest[0] + 1) // 2
-        payload += bytes([length]) + struct.pack(f">{count}H", *rest[1 : 1 + count])[:length]
-        rest = rest[1 + count :]
+        length = text_words[0]
+        end = 1 + (length + 1) // 2
+        text = struct.pack(f">{end - 1}H", *text_words[1:end])
+        payload += bytes([length]) + text[:length]
+        text_words = text_words[end:]
     return payload

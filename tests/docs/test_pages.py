@@ -32,7 +32,7 @@ from controller.cli.main import join_commands
 from controller.daemon.config import DaemonSection, LogSection, TouchSection
 from controller.operation.operation_states import DaemonState
 from drivers.by_hand.cli import amp
-from drivers.by_hand.reaching import check_links
+from drivers.by_hand.links import check_links
 from drivers.errors import CommandError
 from drivers.protocol.definition import BOOT_TIME
 from drivers.wires.wire import address_of

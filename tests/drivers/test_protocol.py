@@ -17,7 +17,7 @@ import pytest
 
 from amplifier_eds import eds_text
 from drivers import trace
-from drivers.by_hand.reaching import status_rows
+from drivers.by_hand.rows import status_rows
 from drivers.errors import CommandError
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (

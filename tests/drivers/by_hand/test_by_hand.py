@@ -23,12 +23,8 @@ from cases import shortly
 from drivers.by_hand import actions
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.by_hand.cli import app
-from drivers.by_hand.reaching import (
-    Arrangement,
-    arrangement_of,
-    check_links,
-    identify_all,
-)
+from drivers.by_hand.discovery import identify_all
+from drivers.by_hand.links import Arrangement, arrangement_of, check_links
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
@@ -461,7 +457,7 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
 def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason stands with the port."""
     port = ListPortInfo("/dev/no-such-port")
-    monkeypatch.setattr("drivers.by_hand.reaching.comports", lambda: [port])
+    monkeypatch.setattr("drivers.by_hand.discovery.comports", lambda: [port])
     result = invoke("discover")
     assert result.exit_code == 0, result.output
     assert "no such port" in result.stdout

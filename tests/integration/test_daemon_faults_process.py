@@ -231,13 +231,17 @@ async def test_daemon_replays_nothing_when_paused_longer_than_watchdog(tmp_path:
                     for number in range(50):
                         frame = TouchFrame("old", 0.0, (Touch(1, 0.01 * number, 0.5),))
                         sender.sendto(tuio_datagram(frame, -1), ("127.0.0.1", port))
+                    sender.sendto(b"the last one", ("127.0.0.1", port))  # will be rejected
             resumed = time.monotonic()
             os.kill(daemon.process.pid, signal.SIGCONT)
             await until_state(era, "FAULT")
             await ready(era)
             async with asyncio.timeout(PATIENCE):
-                while (await era.status()).contacts:  # noqa: ASYNC110  until those have expired
+                status = await era.status()
+                # Until all queued touches have been read, and their contacts have expired.
+                while status.contacts or not status.rejected_touches:
                     await asyncio.sleep(0.05)
+                    status = await era.status()
             await armed(era)
             await journal.hear(10)
             sent = journal.raising_since(resumed)

@@ -227,9 +227,9 @@ def _heading(threshold: str, *, has_latency: bool) -> str:
     if has_latency:
         groups += f" {'latency':>7}"
         units += f" {'/ ms':>7}"
-    pair = " prom.  meas."
+    pair = " prom.   sim."
     columns = f" time  target / cm  others  {'ERAs':22} {pair}  {pair}"
-    scale = f"{scale_in_words(threshold)}; contrasts are the lowest of all sets"
+    scale = f"{scale_in_words(threshold)}; contrasts are the lowest over all threshold sets"
     return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
 
 
@@ -292,8 +292,8 @@ def _summary(rows: "list[TouchRow]") -> str:
     kept_count = sum(bool(row.keeps_promise) for row in judged)
     share = kept_count / len(judged)
     return (
-        f"{touches}; of {len(judged)} with other fingers on the plate {kept_count} "
-        f"({share:.0%}) felt at least the promised contrast\n"
+        f"{touches}; with other fingers on the plate, {kept_count} of {len(judged)} "
+        f"({share:.0%}) had at least the promised contrast\n"
         "(90 % of plates within the rig's tolerances reach a promise; --seed draws another plate)"
     )
 

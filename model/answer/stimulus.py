@@ -301,7 +301,7 @@ def check_level(level_db_sl: float) -> None:
         raise InputError(
             f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
             f"{level_db_sl:g}; 20 is strong, 12 is felt, 0 is the threshold, and at "
-            f"{MAX_LEVEL_DB_SL:g} the exposure is 12 to 60 m/s² (ISO 5349-1)"
+            f"{MAX_LEVEL_DB_SL:g} the exposure is 10 to 240 m/s² (ISO 5349-1)"
         )
 
 

@@ -270,7 +270,7 @@ def _rows_of_fingers(found: dict[str, Any], threshold_sets: Sequence[str]) -> It
     from model.answer.answer import verdict_shown
     from model.finger import scale_in_words
 
-    yield f"{scale_in_words(threshold_sets[0])}; contrasts are the lowest of all sets"
+    yield f"{scale_in_words(threshold_sets[0])}; contrasts are the lowest over all threshold sets"
     yield "finger [m]         frequency       level    contrast  nominal  foreign level    exposure"
     for finger in found["fingers"]:
         layer = finger["layer"]

@@ -88,8 +88,8 @@ FINDING_KINDS = {
     "mirrored": FindingKind(
         "PLACES: sensor positions must be measured from the same corner as ERA positions, "
         "got positions mirrored in {of}: {coarse}; correct all sensor positions{or_plugs}",
-        "a coarse fit with mirrored sensor positions leaves less than 0.6 times as much of the "
-        "responses unexplained; the check continues with the mirrored positions",
+        "in a coarse fit, mirrored sensor positions reduce the unexplained share to less than 0.6 "
+        "of its value; the check continues with the mirrored positions",
         "file",
     ),
     "reversed": FindingKind(
@@ -108,8 +108,8 @@ FINDING_KINDS = {
         "GRAIN: plate.grain must be {along}, got {as_written}: a coarse fit leaves {percent} of "
         "the responses unexplained with the grain along the {along}, {percent_as_written} with "
         "the grain along the {as_written}; look at the veneer of its faces, and correct the rig",
-        "a coarse fit with the grain along the other side leaves less than 0.6 times as much of "
-        "the responses unexplained; the check continues with that grain",
+        "in a coarse fit, the grain along the other side reduces the unexplained share to less "
+        "than 0.6 of its value; the check continues with that grain",
         "file",
     ),
     "resonance": FindingKind(
@@ -117,8 +117,8 @@ FINDING_KINDS = {
         "a glued magnet resonates at {value:.0f} Hz and gains vary by a factor of "
         "{factor:.2g} over frequency; if {as_written}, by {factor_as_written:.2g}; correct the rig",
         "gains of exciters vary too much over frequency (standard deviation of their logarithm "
-        "above 0.8), and less than half as much if the resonance in the file is the other one of "
-        "`free` and `mounted`; the check continues with that one",
+        "above 0.8), but less than half as much with the other `resonance_is`; the check "
+        "continues with the other",
         "file",
     ),
     "swapped": FindingKind(
@@ -151,20 +151,20 @@ FINDING_KINDS = {
     "loose": FindingKind(
         "LOOSE: {wiring} acts on the plate with only part of its contact, such as an exciter "
         "whose glue has come off: press it on or glue it again, and measure again",
-        "the plate does not match, and the parameter farthest off is an exciter with less than "
-        "0.7 of its stiffness or weight; or a channel's gain rises with frequency relative to "
+        "the plate does not match, and the parameter farthest off is the stiffness or weight of "
+        "an exciter, below 0.7 of its value; or a channel's gain rises with frequency relative to "
         "the other channels",
     ),
     "weak": FindingKind(
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`",
-        "the gain is below 0.8 of the rig's, or beyond 3.5 standard deviations of the `gain` "
-        "(for exciters also `stiffness`) in the rig's `uncertainty`, if that limit is wider",
+        "the gain is below 0.8 of the rig's; if the rig's `uncertainty` is large, below 3.5 "
+        "standard deviations of its `gain` (for exciters also `stiffness`)",
     ),
     "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
         "volume, or correct its stroke or gains in the rig",
-        "as for `weak`, above 1.25",
+        "as for `weak`, but above 1.25 of the rig's",
     ),
     "other ERA": FindingKind(
         "WRONG ERA: {wiring} drives ERA {drives} instead of {of} (MAC {mac_found:.3f}, with its "
@@ -244,10 +244,10 @@ FINDING_KINDS = {
     ),
     "unnamed": FindingKind(
         "UNNAMED: values match the rig, but something else differs: {said}; "
-        "check its thickness, parts bonded to it and the sensors' scales, and measure for `era "
-        "calibrate`",
-        "form errors larger than on 99 % of plates, such as modes shifted by a bonded "
-        "frame, or more than 5 % unexplained",
+        "check the plate's thickness, parts bonded to it and the sensors' scales, and measure for "
+        "`era calibrate`",
+        "form errors (which no rig key describes) are larger than on 99 % of plates, for example "
+        "due to a bonded frame; or more than 5 % is unexplained",
         "form",
     ),
     "promise": FindingKind(

@@ -128,7 +128,7 @@ def check_rows(calibration: Calibration) -> list[str]:
         known,
         held_out=f"sensors {', '.join(held.sensors)}",
         error=held.after,
-        beside=f"by the old rig {percent(held.before)}",
+        beside=f"with the old rig {percent(held.before)}",
     )
 
 

@@ -174,7 +174,10 @@ ROWS = (
     ),
 )
 DRIVEN = {"SW": {"frequency_hz": 50.0}, "SE": {"frequency_hz": 50.0}, "NE": {"frequency_hz": 120.0}}
-SCALE = "levels above the thresholds of vibrotactile-probe; contrasts are the lowest of all sets\n"
+SCALE = (
+    "levels above the thresholds of vibrotactile-probe; "
+    "contrasts are the lowest over all threshold sets\n"
+)
 LINES = """\
   0.3   19.8,  5.9       0  SW SE 50 Hz, NE 120 Hz      -      -    20.0   19.0     9.6
   1.0    5.0,  5.0       2  SW SE 50 Hz, NE 120 Hz   12.2   14.0    20.0   19.0     9.6
@@ -186,7 +189,7 @@ LINES = """\
   still ringing
  12.0   10.0, 10.0       1  SW SE 50 Hz, NE 120 Hz   12.0   14.0    20.0   19.0     9.6\
   own, of 2 contents
-7 touches; of 3 with other fingers on the plate 2 (67%) felt at least the promised contrast
+7 touches; with other fingers on the plate, 2 of 3 (67%) had at least the promised contrast
 """
 
 

@@ -158,8 +158,8 @@ FINDING_KINDS = {
     "weak": FindingKind(
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`",
-        "the gain is below 0.8 of the rig's; if the rig's `uncertainty` is large, below 3.5 "
-        "standard deviations of its `gain` (for exciters also `stiffness`)",
+        "the gain is below 0.8 of the rig's; in a rig with large `uncertainty`, 3.5 standard "
+        "deviations of `gain` (for exciters also `stiffness`) below the rig's",
     ),
     "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "

@@ -21,7 +21,7 @@ from model.quantities import counted
 
 if TYPE_CHECKING:
     from controller.demo.demonstration import DemoRun, Scene
-    from controller.demo.recorder import TouchRow
+    from controller.demo.touch_rows import TouchRow
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
 

@@ -29,14 +29,14 @@ from controller.api.jsonrpc import RpcError
 from controller.api.schema import MAX_LEASE
 from controller.daemon.config import DaemonConfig, TouchInput, load_daemon_config
 from controller.daemon.daemon import Daemon, page_address
-from controller.demo.recorder import (
+from controller.demo.recorder import TouchRecorder
+from controller.demo.simulated_plate import (
     SIM_OPTIONS,
     SIMULATED_WATCHDOG,
     SimulatedPlate,
-    TouchRecorder,
-    TouchRow,
     simulated_plate,
 )
+from controller.demo.touch_rows import TouchRow
 from controller.effects.layout import BUZZ
 from controller.operation.operation_states import DaemonState
 from controller.process.daemon_process import SocketLock
@@ -310,7 +310,7 @@ def _log_errors_only() -> Iterator[None]:
 @contextlib.asynccontextmanager
 async def _on_simulated_plate(
     rig_file: Path,
-    more: Mapping[str, object],
+    daemon_keys: Mapping[str, object],
     *,
     layouts: Sequence[Mapping[str, Any]],
     wire: str,
@@ -318,11 +318,11 @@ async def _on_simulated_plate(
 ) -> AsyncIterator[tuple[DaemonConfig, SocketLock, SimulatedPlate]]:
     """Configuration and socket of a daemon of a rig, and the plate that it drives.
 
-    more: keys of the daemon file other than the rig; layouts: contents of its layouts.
+    daemon_keys: keys of the daemon file other than the rig; layouts: contents of its layouts.
     """
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
-        config = load_daemon_config(_daemon_file(folder, rig_file, more, layouts))
+        config = load_daemon_config(_daemon_file(folder, rig_file, daemon_keys, layouts))
         lock = SocketLock(config.socket)
         stack.callback(lock.release)
         rig = config.rig
@@ -336,7 +336,7 @@ async def _on_simulated_plate(
 def _daemon_file(
     folder: Path,
     rig_file: Path,
-    more: Mapping[str, object],
+    daemon_keys: Mapping[str, object],
     layouts: Sequence[Mapping[str, Any]],
 ) -> Path:
     """Write the daemon's file; it names the rig by a link, since a path may be any bytes."""
@@ -345,7 +345,7 @@ def _daemon_file(
     named = {_layout_name(number): f"{number}.yaml" for number in range(len(layouts))}
     for name, layout in zip(named.values(), layouts, strict=True):
         (folder / name).write_text(json.dumps(layout), encoding="utf-8")
-    content = {"rig": _RIG_FILE, "layouts": named, **more}
+    content = {"rig": _RIG_FILE, "layouts": named, **daemon_keys}
     file.write_text(json.dumps(content), encoding="utf-8")
     return file
 
@@ -493,8 +493,9 @@ def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:
         if row.measured_level_db_sl is not None:
             by_count.setdefault(len(row.quiet), []).append(row)
     by_count[0] = by_count.get(0, [])[:1]
-    in_turn = zip_longest(*(by_count[count] for count in sorted(by_count)))
-    chosen = [row for each in in_turn for row in each if row is not None]
+    chosen: list[TouchRow] = []
+    for next_rows in zip_longest(*(by_count[count] for count in sorted(by_count))):
+        chosen += [row for row in next_rows if row is not None]
     return sorted(chosen[:MAX_PANELS], key=lambda row: len(row.quiet))
 
 
@@ -534,10 +535,11 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     level = row.levels_db_sl.get(row.target_id)
     draw_fingertip(axes, target, felt=True, level_db_sl=level, others=quiet)
     for id, position in row.quiet.items():
-        others = [target, *(other for other in quiet if other != position)]
+        neighbours = [target, *(tip for tip in quiet if tip != position)]
         level = row.levels_db_sl.get(id)
-        draw_fingertip(axes, position, felt=False, level_db_sl=level, others=others)
-    contrast, promised = row.measured_contrast_db, row.promised_contrast_db
+        draw_fingertip(axes, position, felt=False, level_db_sl=level, others=neighbours)
+    contrast = row.measured_contrast_db
+    promised = row.promised_contrast_db
     title = "single finger" if contrast is None else f"contrast {contrast:.1f} dB"
     if promised is not None:
         title += f"\n(promised {promised:.1f} dB)"

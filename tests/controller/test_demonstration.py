@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from controller.demo import demonstration
-from controller.demo import recorder as far_end
+from controller.demo import simulated_plate as far_end
 from controller.demo.demonstration import (
     DemoRun,
     Pictures,
@@ -24,15 +24,9 @@ from controller.demo.demonstration import (
     example_scenes,
     run_demo,
 )
-from controller.demo.recorder import (
-    FingerRow,
-    FingerVibration,
-    SimulatedPlate,
-    TouchRecorder,
-    TouchRow,
-    simulated_plate,
-    steady_contrast_db,
-)
+from controller.demo.recorder import TouchRecorder
+from controller.demo.simulated_plate import FingerVibration, SimulatedPlate, simulated_plate
+from controller.demo.touch_rows import FingerRow, TouchRow, steady_contrast_db
 from controller.play.intent import not_served
 from controller.play.reports import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame

@@ -30,7 +30,7 @@ from unittest.mock import Mock
 import pytest
 
 import controller.demo.demonstration
-import controller.demo.recorder
+import controller.demo.simulated_plate
 import dashboard_pictures
 import live_demonstration
 import model
@@ -428,8 +428,8 @@ def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
     def killing(*arguments, on_row):
         return TouchRecorder(*arguments, on_row=lambda row: far_ends[0].kill())
 
-    start_far_end = controller.demo.recorder.start_simulation
-    monkeypatch.setattr(controller.demo.recorder, "start_simulation", start)
+    start_far_end = controller.demo.simulated_plate.start_simulation
+    monkeypatch.setattr(controller.demo.simulated_plate, "start_simulation", start)
     monkeypatch.setattr(controller.demo.demonstration, "TouchRecorder", killing)
     status, out, said = demo("--real-time", "--touches", capture)
     assert status == 3, said

@@ -12,7 +12,7 @@ from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Layer
 from model.arrays import Point
 
-Vibration: TypeAlias = Mapping[str, FingerVibration]
+_Vibration: TypeAlias = Mapping[str, FingerVibration]
 """Measured vibration by id of a finger's sensor."""
 
 _NOT_IN_JSON = ("target_id", "quiet", "pattern", "levels_db_sl", "fingers", "contents")
@@ -113,7 +113,7 @@ def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]
 
 
 def with_values(
-    row: TouchRow, report: PlayReport, key: ContactKey, vibration: Vibration
+    row: TouchRow, report: PlayReport, key: ContactKey, vibration: _Vibration
 ) -> TouchRow:
     """Complete the row of a touch with the predicted and measured values of a pattern.
 
@@ -167,7 +167,7 @@ def with_values(
     )
 
 
-def _finger_row(felt: FingerSensation, vibration: Vibration) -> FingerRow:
+def _finger_row(felt: FingerSensation, vibration: _Vibration) -> FingerRow:
     """Make the row of a finger among several contents."""
     level = None
     contrast = None
@@ -190,7 +190,7 @@ def _finger_row(felt: FingerSensation, vibration: Vibration) -> FingerRow:
 
 
 def _target_and_quiet(
-    vibration: Vibration, felt: FingerSensation, quiet_contacts: Sequence[Contact]
+    vibration: _Vibration, felt: FingerSensation, quiet_contacts: Sequence[Contact]
 ) -> tuple[FingerVibration | None, list[FingerVibration]]:
     """Return the vibration of target and quiet fingers; no target unless all were measured."""
     target = vibration.get(sensor_id(felt.contact))

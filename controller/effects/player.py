@@ -257,15 +257,15 @@ class EffectPlayer:
         """Start and end effects if a finger has moved to another region."""
         position = (contact.x, contact.y)
         region = self.layout.region_at(*position)
-        left = finger.region
-        if region is left:
+        left_region = finger.region
+        if region is left_region:
             return
         finger.region = region
         finger.entered = position
         finger.plays = [play for play in finger.plays if play.is_requested]
         self._enter(finger, contact, now)
-        if left is not None and left.on_release is not None:
-            self._start(finger, left, left.on_release, contact, now)
+        if left_region is not None and left_region.on_release is not None:
+            self._start(finger, left_region, left_region.on_release, contact, now)
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
         """Start the effects of the region that a finger enters, or the effect outside all."""

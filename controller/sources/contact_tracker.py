@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # numpy is slow to import
     from model.structure.plate import Plate
 
 RIM = 0.0065
-"""Distance [m] beyond the plate's edge where a finger still counts as on it: a fingertip's radius.
+"""Distance [m] beyond the plate's edge within which a finger counts as on the edge: its radius.
 
 The position that cameras and frames report for a finger on the edge depends on noise and
 calibration.
@@ -48,7 +48,7 @@ class ContactTracker:
         self.next_expiry = math.inf
         """Time [s] when the next contacts are lifted, unless a frame of their source arrives."""
         self.changed: dict[ContactKey | None, float] = {}
-        """Time [s] of each contact's first change not yet answered by a set; None: of lifts."""
+        """Time [s] of each contact's first change not yet answered by a set; None: first lift."""
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
         self._frames: dict[str, TouchFrame] = {}  # last frame of each source
@@ -260,15 +260,15 @@ def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) 
     candidates: list[int] = [*range(len(sources))]
     for depth, group_of in enumerate(groupings):
         counts = Counter(group_of(sources[index]) for index in candidates)
-        own = group_of(newcomer)
-        if max(counts.values(), default=0) > counts[own] + 1:
+        own_group = group_of(newcomer)
+        if max(counts.values(), default=0) > counts[own_group] + 1:
             for deeper_group_of in groupings[depth:]:
                 groups = [deeper_group_of(sources[index]) for index in candidates]
                 ((fullest, _),) = Counter(groups).most_common(1)
                 pairs = zip(candidates, groups, strict=True)
                 candidates = [index for index, group in pairs if group == fullest]
             return candidates[-1]
-        candidates = [index for index in candidates if group_of(sources[index]) == own]
+        candidates = [index for index in candidates if group_of(sources[index]) == own_group]
     return None
 
 

@@ -42,7 +42,7 @@ _MAX_MESSAGES = 256  # per datagram: some 4 ms, and ten times the maximum number
 _MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # OSC string, NUL-padded
-# As in the reference client, a sequence number that drops by more than 100 is a restarted sender.
+# Like in the reference client, a sequence number that drops by more than 100 is a restarted sender.
 # A pause reveals a restart within the first 100 frames: reordered frames are never this late.
 _LATE_FRAMES = 100
 # Senders such as the reference implementation are silent while fingers rest; some repeat the alive
@@ -59,7 +59,7 @@ _MIN_REPEATS = 20  # consecutive frames without cursors, of a sender that repeat
 
 @dataclass
 class _Profile:
-    """Contacts of one profile, from a bundle or from all bundles of a sender."""
+    """Contacts of a profile, from a bundle or from all bundles of a sender."""
 
     alive: tuple[int, ...] | None = None  # until stated
     touches: dict[int, Touch] = field(default_factory=dict)  # by session id
@@ -116,7 +116,7 @@ class _Sender:
         """Return the contacts of profiles received since a time [s].
 
         A contact that is both a cursor and a blob is a cursor with the blob's size, and keeps its
-        id as long as either of them is alive.
+        id as long as the cursor or the blob is alive.
         """
         received: dict[_Key, Touch] = {}
         for address, profile in self.profiles.items():
@@ -238,7 +238,7 @@ class TuioSource(UdpSource):
     def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
         """Return the waiting datagrams, except those superseded by a newer bundle of their kind.
 
-        Bundles of one sender with the same profiles are of the same kind. A bundle supersedes older
+        Bundles of the same sender and profiles have the same kind. A bundle supersedes older
         ones if it is complete: it has all active contacts, with their positions.
         """
         current = []  # newest first

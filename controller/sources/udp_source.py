@@ -151,8 +151,8 @@ async def listen(
     drops superseded datagrams where many wait.
     """
     loop = asyncio.get_running_loop()
-    found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-    family, kind, protocol, _, address = found[0]
+    addresses = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    family, kind, protocol, _, address = addresses[0]
     endpoint = socket.socket(family, kind, protocol)
     try:
         endpoint.setblocking(False)
@@ -187,8 +187,8 @@ class UdpSource(TouchSource):
         self.opened = math.inf
         """When the port was bound [s]."""
         address, _, options = url.partition("?")
-        scheme, _, rest = address.partition(":")
-        host, _, port = rest.removeprefix("//").rpartition(":")
+        scheme, _, host_and_port = address.partition(":")
+        host, _, port = host_and_port.removeprefix("//").rpartition(":")
         self.host = host.strip("[]") or DEFAULT_HOST
         port = port or self.default_port
         if not _PORT.fullmatch(port) or int(port) > 65535:

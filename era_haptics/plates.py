@@ -239,8 +239,8 @@ class SolvedPlate:
 
 
 def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
-    """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), with ERAs and nulls (red
-    crosses).
+    """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), with ERAs and nulls
+    (white lines).
 
     Same picture as `era plate map`. Raises InputError for a drive that the rig cannot play.
 

@@ -270,7 +270,7 @@ async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) ->
             lambda text: re.search(r"\b2\b.* dB SL.* dB ", text) is not None,
         )
         scale = await page.evaluate("document.querySelector('#threshold-set').innerText")
-        assert scale == f"dB SL: {era.status().threshold}"
+        assert scale == f"thresholds: {era.status().threshold}"
         await page.touch("touchMove", await on_plate(page, (0.2, 0.7), (0.6, 0.5)))
         await until_last(era, lambda x: abs(x - 0.6 * LENGTH) < 1e-3)
     assert await contacts(era, 0) == []
@@ -445,7 +445,7 @@ async def test_elements_have_roles_names_and_tab_order(fresh: Page) -> None:
         ("checkbox", "slow motion"),
         ("list", "Events, newest first"),
         ("region", "Amplifiers"),
-        ("region", "Touch to wire"),
+        ("region", "Latency from touch to wire"),
         ("meter", "channel 0, ERA SW: 0 %"),
     } <= {(role, name.removesuffix(" space")) for role, name in named}
     order = []
@@ -538,7 +538,7 @@ async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
     unknown = ("channels: unknown", "unknown")
     assert shown == [
         ["tile bad", "left", "no link", *unknown, "72 rpm", "1 s ago"],
-        ["tile", "right", "closed with a lost amplifier", *unknown, "1 s ago"],
+        ["tile", "right", "closed: another amplifier is lost", *unknown, "1 s ago"],
     ]
 
 

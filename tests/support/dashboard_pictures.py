@@ -1,7 +1,9 @@
-"""`python tests/support/dashboard_pictures.py FOLDER`: the dashboard as it looks, on every screen.
+"""Take pictures of the dashboard on every screen.
 
-A daemon over a simulated amplifier, armed, two people with a finger each on the plate: on a
-desktop, a tablet and a phone. docs/pictures/dashboard.png is dashboard_desktop.png of these.
+    python tests/support/dashboard_pictures.py FOLDER
+
+A daemon over a simulated amplifier is armed, and two people have a finger each on the plate. The
+screens are a desktop, a tablet and phones. docs/pictures/dashboard.png is dashboard_desktop.png.
 """
 
 import asyncio

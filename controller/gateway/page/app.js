@@ -154,7 +154,7 @@ function showStatus(status) {
 
 // Show the name of the rig's threshold set; levels in dB SL are relative to it.
 function showThresholdSet(name) {
-  at("threshold-set").textContent = `dB SL: ${name}`;
+  at("threshold-set").textContent = `thresholds: ${name}`;
   at("threshold-set").hidden = name === null;
 }
 
@@ -213,7 +213,7 @@ function summarisePattern({ contacts }) {
   const targets = contacts.filter(({ role }) => role === "target").map((contact) => {
     const { verdict, frequency_hz, level_db_sl, promised_contrast_db, held_back } = contact;
     if (verdict === "held back") return held_back;
-    const contrast = promised_contrast_db === null ? "" : `, at least ${atLeast(promised_contrast_db)} dB over others`;
+    const contrast = promised_contrast_db === null ? "" : `, at least ${atLeast(promised_contrast_db)} dB above the others`;
     return `${fixed(frequency_hz)} Hz ${felt(contact)}, ${fixed(level_db_sl)} dB SL${contrast}`;
   });
   const isDrawn = contacts.every(({ verdict }) => verdict !== "held back");

@@ -2,7 +2,8 @@
 
 const AMPLITUDE = ["#0b1026", "#27306b", "#4b3f8f", "#8a4f8d", "#c8637a", "#f08c5a", "#fbc557", "#fdf3a7"];
 const MOTION = ["#053061", "#2f79b5", "#a7cfe4", "#f4f4f4", "#f9b98e", "#c8493a", "#67001f"];
-const CONTENTS = ["#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2", "#c58bff", "#e8e34f", "#59e0e8", "#ff7d66"];
+// In the order of the contents; the first two are as different as possible for colour-blind people.
+const CONTENTS = ["#ffa62b", "#4f9dff", "#35e07a", "#ff5fa2", "#c58bff", "#e8e34f", "#59e0e8", "#ff7d66"];
 const GREY = 0.62;  // for mixed contents
 const OWN_DB = 12;  // a content this far above all others is felt as a finger's own
 const BRIGHTEST_DB = 30;  // above the detection threshold

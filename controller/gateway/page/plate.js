@@ -203,7 +203,7 @@ export class PlateOverlay {
     const rings = layer === undefined ? [ring] : [this.circle(contact, "halo", this.ringRadius), ring];
     if (layer !== undefined) ring.style.stroke = colourOf(layer);
     const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : ["quiet", "hand", "surplus"].includes(role) ? role : "";
-    let below = role === "target" && isKnown(promised) ? `≥ ${atLeast(promised)} dB over others` : "";
+    let below = role === "target" && isKnown(promised) ? `≥ ${atLeast(promised)} dB above others` : "";
     if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${felt(contact)}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
     if (held_back && verdict) below = verdict;
     return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];

@@ -25,7 +25,7 @@ function ageText(seconds) {
 
 function silenceText({ silence, may_play_for_s }) {
   if (silence !== "may_play") return "unconfirmed; its watchdog has elapsed";
-  return may_play_for_s === null ? "may play until it is switched off" : `may play for ${fixed(may_play_for_s, 2)} s more`;
+  return may_play_for_s === null ? "can play until it is switched off" : `can play for ${fixed(may_play_for_s, 2)} s more`;
 }
 
 // eras: the rig's ERAs, for channel names. readings: from the daemon's hello: the readings to show, and their format.
@@ -34,7 +34,7 @@ function tile(amplifier, eras, readings) {
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty || reports.length ? "tile bad" : "tile");
   const title = element("h3");
-  const status = lost ? "no link" : closed_with_lost ? "closed with a lost amplifier" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : word ?? "unknown";
+  const status = lost ? "no link" : closed_with_lost ? "closed: another amplifier is lost" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : word ?? "unknown";
   title.append(element("span", name), element("span", status));
   title.title = state ?? "";
   made.append(title);
@@ -94,7 +94,7 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
     }
   });
   add("line", { x1: 0, x2: 320, y1: 80, y2: 80 });
-  add("text", { x: 320, y: 10, "text-anchor": "end" }, "ms (logarithmic count)");
+  add("text", { x: 320, y: 10, "text-anchor": "end" }, "latency in ms, counts on a logarithmic scale");
   svg.replaceChildren(...parts);
 }
 

@@ -2,16 +2,13 @@
 
 Time is passed in; only `keep_time` reads a clock. Channels drive the ERAs according to the rig's
 wiring, with the given imperfections; level 1 is the full stroke.
-
-The plate is solved again whenever the motion of a base changes, and a host changes the rate of an
-amplifier's clock with every Ping. The plate therefore uses a straight clock for each amplifier
-until it differs by `WRONG` from the amplifier's own clock.
 """
 
 import asyncio
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from types import MappingProxyType
 from typing import TypeAlias
@@ -19,7 +16,6 @@ from typing import TypeAlias
 import numpy as np
 
 from drivers.playing import Voice
-from drivers.protocol.definition import CLOCK_TURN
 from drivers.protocol.records import Values
 from model.arrays import Point
 from model.fem import Mesh
@@ -38,6 +34,7 @@ from model.transients.base_motion import Motion
 from registry import limits, threads
 from sim.amplifier.amplifier_clock import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
+from sim.bench.straight_clocks import StraightClocks
 from sim.plant.era_motions import harmonics_of_voices, motion_of, realised
 from sim.plant.finger_placement import FingerPlacement
 from sim.plant.fingers import (
@@ -51,69 +48,21 @@ from sim.plant.imperfections import Imperfections
 from sim.plant.loaded_plate import LoadedPlate
 from sim.plant.plant import PLANT_SAMPLE_RATE, Plant
 
-WRONG = 0.5e-6
-"""Largest error of a clock of the plate [s], 0.1 degrees at 500 Hz; then it is replaced."""
-
-_SOON = 0.05  # s; a clock wrong within this time has a new rate, not a corrected one
-_ALIKE = 10e-6  # of a pace; tolerance of rates that a host derives from inexact readings
-_DRIFT = 0.1e-6  # s; tolerance for the warm-up of a crystal
-
-
-class StraightClocks:
-    """Straight approximations of amplifier clocks by name, valid at a time [s]."""
-
-    def __init__(self, clocks: Mapping[str, AmplifierClock], *, time: float) -> None:
-        self._clocks = clocks
-        self.straight = {name: clock.straight(time) for name, clock in clocks.items()}
-        """Current clocks by name."""
-        self._due = dict.fromkeys(clocks, time)
-        self._changes = dict.fromkeys(clocks, 0)
-        self.renew(time)
-
-    @property
-    def next_due(self) -> float:
-        """Time [s] of the next check of a clock."""
-        return min(self._due.values())
-
-    def renew(self, time: float) -> list[str]:
-        """Replace clocks that are no longer valid at a time [s]; return their names."""
-        renewed = []
-        for name, clock in self._clocks.items():
-            if time < self._due[name] and self._changes[name] == clock.changes:
-                continue
-            self._changes[name] = clock.changes
-            now = clock.straight(time)
-            lasts = _lasts(self.straight[name], now)
-            if lasts < _SOON:
-                known = self.straight[name]
-                # The mean pace since the previous replacement, if it is similar.
-                mean = known.pace + _behind(known, now) / max(now.time - known.time, _SOON)
-                self.straight[name] = (
-                    now._replace(pace=mean) if abs(mean - now.pace) < _ALIKE else now
-                )
-                lasts = _lasts(self.straight[name], now)
-                renewed.append(name)
-            self._due[name] = time + min(lasts / 2, clock.steady(time, _DRIFT))
-        return renewed
-
-
-def _lasts(known: StraightClock, now: StraightClock) -> float:
-    """Return how long [s] a clock remains accurate, negative if it is wrong."""
-    drift, left = abs(now.pace - known.pace), WRONG - abs(_behind(known, now))
-    return left / drift if drift else math.copysign(math.inf, left)
-
-
-def _behind(known: StraightClock, now: StraightClock) -> float:
-    """Return the lag of a clock behind the current one [s]."""
-    return math.remainder(now.shown - known.at(now.time), CLOCK_TURN)
-
-
 _TICK = 0.01  # s; of `keep_time`
 _MAX_BEHIND = 0.1  # s; lag of the plate behind the amplifiers
 _MAX_STEP = 1.0  # s; sampled in one step
 
 Voices: TypeAlias = tuple[Voice, ...]
 """Voices of a channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Output:
+    """Voices that move the base of an ERA by index, until a time [s]."""
+
+    era: int
+    voices: Voices
+    end: float
 
 
 class Bench:
@@ -139,13 +88,12 @@ class Bench:
         """The rig with the errors of plate and ERAs, and its feet."""
         self.time = now
         """Current time [s]."""
-        # Lags behind the amplifiers, in few large steps: nothing acts back on them.
+        # The plate lags behind the amplifiers, in few large steps: it does not act back on them.
         self._plant = _plant_of(self.real, now)
-        self._sampled_until = now  # up to when [s] fingers have samples
+        self._sampled_until = now  # time [s] up to which fingers have samples
         self._fingers = PlateFingers(self._plant.reduced)
-        # Fingers not yet on the plate; the newest placement, and the placement that loads the
-        # plate.
-        self._placements: deque[FingerPlacement] = deque()
+        self._placements: deque[FingerPlacement] = deque()  # not yet on the plate
+        # Of the newest placement: positions and contacts of its fingers.
         self.positions: Mapping[str, Point] = {}
         self._contacts: Mapping[str, FingertipLoad] = {}
         self.observers: frozenset[str] = frozenset()  # fingers without weight
@@ -161,14 +109,14 @@ class Bench:
         }
         clocks = {name: amplifier.clock for name, amplifier in self.amplifiers.items()}
         self._clocks = StraightClocks(clocks, time=now)
-        # By ERA: voices of its channel, and those moving its base after the amplifier's delay.
+        # By ERA: its channel, the voices of the channel, and the voices that move its base, which
+        # follow after the amplifier's delay.
         self._wired = [rig.wiring[era.name] for era in rig.eras]
         self._commanded: list[Voices] = [()] * len(rig.eras)
         self._applied_outputs: list[Voices] = [()] * len(rig.eras)
-        self._delays = [imperfections.delays.get(one.amplifier, 0.0) for one in self._wired]
+        self._delays = [imperfections.delays.get(channel.amplifier, 0.0) for channel in self._wired]
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
-        # Voices that moved the base of an ERA, with the time of their end [s].
-        self._played: deque[tuple[int, Voices, float]] = deque()
+        self._ended_outputs: deque[_Output] = deque()
 
     @property
     def fingers(self) -> PlateFingers:
@@ -218,8 +166,8 @@ class Bench:
     ) -> None:
         """Replace the fingers by those at these positions [m]; InputError changes nothing.
 
-        observers: fingers without weight; loads: of the others relative to the rig's fingertip, 1
-        where left out.
+        observers: fingers without weight; loads: of other fingers relative to the rig's fingertip,
+        by default 1.
         """
         self.begin_placing(positions, now=now, observers=observers, loads=loads)
         self._sample_plate()
@@ -232,7 +180,7 @@ class Bench:
         observers: Collection[str] = (),
         loads: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """Replace the fingers as `place_fingers`, with the plate under them still to be solved.
+        """Replace the fingers like `place_fingers`, but do not solve the plate under them yet.
 
         The amplifiers go on; the plate waits at this time until `unsolved` is solved or read.
         """
@@ -242,11 +190,12 @@ class Bench:
         self.observers = frozenset(observers) & positions.keys()
         self.loads = {name: load for name, load in loads.items() if name in positions}
         self.positions = dict(positions)
-        before, self._contacts = self._contacts, self._contacts_at(positions)
+        contacts = self._contacts_at(positions)
         solve = None
-        if self._contacts != before:
-            solution = self._plant.solution(self._contacts, time=self.time)
+        if contacts != self._contacts:
+            solution = self._plant.solution(contacts, time=self.time)
             solve = partial(_tabulated, solution, self.sample_rate)
+        self._contacts = contacts
         placement = FingerPlacement(self.time, positions, self._contacts, solve)
         if len(self._placements) > 1 and placement.supersedes(*list(self._placements)[-2:]):
             self._placements.pop()
@@ -255,7 +204,10 @@ class Bench:
     @property
     def unsolved(self) -> FingerPlacement | None:
         """The first pending placement of fingers without a solved plate, if any."""
-        return next((one for one in self._placements if not one.is_solved), None)
+        for placement in self._placements:
+            if not placement.is_solved:
+                return placement
+        return None
 
     def records(self, since: float, until: float) -> tuple[dict[str, FingerRecord], list[float]]:
         """The record of each finger in a window of the last ten seconds [s], by id.
@@ -263,18 +215,25 @@ class Bench:
         Also the frequencies [Hz] driven in it, ascending.
         """
         self._sample_plate(until)
-        present = [(index, output, math.inf) for index, output in enumerate(self._applied_outputs)]
-        driven = {
-            tone.frequency
-            for index, output, end in [*self._played, *present]
-            for tone in output
-            if tone.transition.start + self._delays[index] < until
-            and min(end, tone.silent_from + self._delays[index]) > since
-        }
-        return self._fingers.felt(since, until), sorted(driven)
+        return self._fingers.felt(since, until), self._driven_frequencies(since, until)
+
+    def _driven_frequencies(self, since: float, until: float) -> list[float]:
+        """Frequencies [Hz] that drive an ERA in a window [s], ascending."""
+        outputs = list(self._ended_outputs)
+        for era, voices in enumerate(self._applied_outputs):
+            outputs.append(_Output(era, voices, math.inf))
+        frequencies: set[float] = set()
+        for output in outputs:
+            delay = self._delays[output.era]
+            for voice in output.voices:
+                begin = voice.transition.start + delay
+                end = min(output.end, voice.silent_from + delay)
+                if begin < until and end > since:
+                    frequencies.add(voice.frequency)
+        return sorted(frequencies)
 
     def felt(self, since: float, until: float) -> dict[str, FeltVibration]:
-        """Vibration at each finger in such a window, by id."""
+        """Vibration at each finger in a window of the last ten seconds [s], by id."""
         records, frequencies = self.records(since, until)
         return {name: measure_vibration(record, frequencies) for name, record in records.items()}
 
@@ -293,34 +252,40 @@ class Bench:
 
     def _contacts_at(self, positions: Mapping[str, Point]) -> Mapping[str, FingertipLoad]:
         """The fingers that load the plate, and the patches of hands."""
-        fingertip, size = self.rig.fingertip, (self.rig.plate.length, self.rig.plate.width)
+        fingertip = self.rig.fingertip
         if fingertip is None:
             return {}
-        found = dict[str, FingertipLoad]()
-        for name, at in positions.items():
-            if name not in self.observers:
-                places, loads = with_patches([at], [self.loads.get(name, 1.0)], size)
-                for number, (place, load) in enumerate(zip(places, loads, strict=True)):
-                    patch = f"{name} patch {number}" if number else name
-                    tip = self.imperfections.load_of(name, fingertip.under(load))
-                    found[patch] = FingertipLoad(*place, tip)
-        return found
+        contacts: dict[str, FingertipLoad] = {}
+        plate_size = (self.rig.plate.length, self.rig.plate.width)
+        for name, position in positions.items():
+            if name in self.observers:
+                continue
+            load = self.loads.get(name, 1.0)
+            patch_positions, patch_loads = with_patches([position], [load], plate_size)
+            patches = zip(patch_positions, patch_loads, strict=True)
+            for number, (patch_position, patch_load) in enumerate(patches):
+                key = f"{name} patch {number}" if number else name
+                loading = self.imperfections.load_of(name, fingertip.under(patch_load))
+                contacts[key] = FingertipLoad(*patch_position, loading)
+        return contacts
 
     def _sample_plate(self, until: float = math.inf, *, solves: bool = True) -> None:
-        """Advance the plate to a time [s] or the current one.
+        """Advance the plate to a time [s], at most to the current time.
 
-        solves: whether to solve unsolved placements; otherwise stops at the first unsolved one.
+        solves: whether to solve unsolved placements; otherwise stop at the first of them.
         """
         end = min(until, self.time)
         while self._placements and self._placements[0].time <= end:
-            if not (solves or self._placements[0].is_solved):
-                end = self._placements[0].time
+            placement = self._placements[0]
+            if not (solves or placement.is_solved):
+                end = placement.time
                 break
-            self._place(self._placements.popleft())
+            self._placements.popleft()
+            self._place(placement)
         self._sample_until(end)
 
     def _sample_what_is_solved(self) -> None:
-        """Advance the plate by a second at most, to a finger that is unsolved."""
+        """Advance the plate by a second at most, up to a placement that is unsolved."""
         self._sample_plate(self._sampled_until + _MAX_STEP, solves=False)
 
     def _place(self, placement: FingerPlacement) -> None:
@@ -347,37 +312,35 @@ class Bench:
     def _update_plant(self) -> None:
         """Pass the voices of channels and their clocks to the plant, after their delay."""
         renewed = self._clocks.renew(self.time)
-        for index, wired in enumerate(self._wired):
-            playing = self.amplifiers[wired.amplifier].outputs[wired.number]
-            commanded = self._commanded[index]
-            is_new = playing is not commanded and playing != commanded
-            if is_new or (commanded and wired.amplifier in renewed):
-                self._commanded[index] = playing
-                self._apply(index, playing, self._clock_of(index))
-        while self._played and self._played[0][2] < self.time - HISTORY_DURATION:
-            self._played.popleft()
+        for era, channel in enumerate(self._wired):
+            voices = self.amplifiers[channel.amplifier].outputs[channel.number]
+            commanded = self._commanded[era]
+            is_new = voices is not commanded and voices != commanded
+            if is_new or (commanded and channel.amplifier in renewed):
+                self._commanded[era] = voices
+                self._apply(era, voices, self._clocks.straight[channel.amplifier])
+        oldest = self.time - HISTORY_DURATION
+        while self._ended_outputs and self._ended_outputs[0].end < oldest:
+            self._ended_outputs.popleft()
 
-    def _clock_of(self, index: int) -> StraightClock:
-        """The clock of the amplifier of an ERA."""
-        return self._clocks.straight[self._wired[index].amplifier]
+    def _apply(self, era: int, voices: Voices, clock: StraightClock) -> None:
+        """Let voices move the base of an ERA according to a clock, after its amplifier's delay."""
+        since = self.time + self._delays[era]
+        self._plant.set_input(era, self._motion(era, voices, clock), since=since)
+        self._ended_outputs.append(_Output(era, self._applied_outputs[era], since))
+        self._applied_outputs[era] = voices
 
-    def _apply(self, index: int, playing: Voices, clock: StraightClock) -> None:
-        """Let an output move the base of an ERA by a clock, after its amplifier's delay."""
-        since = self.time + self._delays[index]
-        self._plant.set_input(index, self._motion(index, playing, clock), since=since)
-        self._played.append((index, self._applied_outputs[index], since))
-        self._applied_outputs[index] = playing
-
-    def _motion(self, index: int, playing: Voices, clock: StraightClock) -> Motion:
-        """The base motion of an ERA by the output of its channel, imperfections included."""
-        stroke, delay = self.rig.eras[index].full_level, self._delays[index]
-        errors = self._errors[index]
-        moving = [*playing, *harmonics_of_voices(playing, errors.harmonic)]
-        return realised(motion_of(moving, clock, stroke=stroke, delay=delay), errors)
+    def _motion(self, era: int, voices: Voices, clock: StraightClock) -> Motion:
+        """The base motion of an ERA due to the voices of its channel, with imperfections."""
+        stroke = self.rig.eras[era].full_level
+        delay = self._delays[era]
+        errors = self._errors[era]
+        all_voices = [*voices, *harmonics_of_voices(voices, errors.harmonic)]
+        return realised(motion_of(all_voices, clock, stroke=stroke, delay=delay), errors)
 
 
 def _tabulated(solve: Callable[[], LoadedPlate], sample_rate: float) -> LoadedPlate:
-    """A plate with the exponentials that are needed first."""
+    """The solved plate, with the exponentials that its first samples need."""
     loaded = solve()
     loaded.exponentials(sample_rate)
     return loaded

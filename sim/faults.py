@@ -34,14 +34,14 @@ FaultKind: TypeAlias = Literal[
     "duplicate",
     "corrupt",
     "truncate",
-    "incomplete_set",  # frames of a set are lost, or the end of a single one
+    "incomplete_set",  # frames of a set are lost, or the end of a single frame
     # of the wire
     "unplug",
     # of the amplifier
     "hang",  # neither replies nor acts
     "reboot",  # without supply until the end
-    "nak_storm",  # refuses everything: BUSY
-    "over_temperature",  # derated, from halfway a fault, cool at the end
+    "nak_storm",  # rejects everything: BUSY
+    "over_temperature",  # derated, from half of the time on a fault, cool at the end
     "over_voltage",
     "arc",
     "over_current",
@@ -55,8 +55,8 @@ _DAMAGING = ("corrupt", "truncate", "incomplete_set")
 class FaultWindow(Section):
     """A fault that is active from `at` for `lasts` [s], as a fault file has it.
 
-    amplifier: None for all. Of frames: share 0..1 that is hit; toward: the direction, None for
-    both; delay [s]: maximum, uniformly distributed.
+    amplifier: None for all. For faults of frames: share: of affected frames, 0..1; toward: their
+    direction, None for both; delay [s]: maximum, uniformly distributed.
     """
 
     fault: FaultKind
@@ -99,34 +99,37 @@ class Faults:
 
         finds_damage: whether the wire itself discards damaged data, like TCP.
         """
-        arriving = [(0.0, frame)]
+        pieces = [(0.0, frame)]
         for window in self.windows:
-            is_hit = self._is_on(window, time) and window.toward in (None, toward)
-            if is_hit and self._random.random() < window.share:
-                if finds_damage and window.fault in _DAMAGING:
-                    return []
-                arriving = self._apply(window, arriving, toward)
-                arriving = [(delay, data) for delay, data in arriving if data]
-        return arriving
+            is_active = self._is_on(window, time) and window.toward in (None, toward)
+            if not is_active or self._random.random() >= window.share:
+                continue
+            if finds_damage and window.fault in _DAMAGING:
+                return []
+            pieces = self._apply(window, pieces, toward)
+            pieces = [(delay, data) for delay, data in pieces if data]
+        return pieces
 
     def _apply(
-        self, window: FaultWindow, arriving: list[tuple[float, bytes]], toward: Toward
+        self, window: FaultWindow, pieces: list[tuple[float, bytes]], toward: Toward
     ) -> list[tuple[float, bytes]]:
-        match window.fault:
-            case "drop":
-                return []
-            case "delay":
-                return [(d + self._random.uniform(0, window.delay), data) for d, data in arriving]
-            case "duplicate":
-                return arriving * 2
-            case "corrupt":
-                return [(delay, self._corrupt(data)) for delay, data in arriving]
-            case "truncate":
-                return [(delay, self._cut(data)) for delay, data in arriving]
-            case "incomplete_set" if toward == "amplifier":
-                return [(delay, self._cut(data)) for delay, data in arriving]
-            case _:
-                return arriving
+        """Apply a fault to the pieces of a frame, each with its delay [s]."""
+        if window.fault == "drop":
+            return []
+        if window.fault == "duplicate":
+            return pieces * 2
+        is_cut = window.fault == "truncate"
+        is_cut |= window.fault == "incomplete_set" and toward == "amplifier"
+        changed = []
+        for delay, data in pieces:
+            if window.fault == "delay":
+                delay += self._random.uniform(0, window.delay)
+            elif window.fault == "corrupt":
+                data = self._corrupt(data)
+            elif is_cut:
+                data = self._cut(data)
+            changed.append((delay, data))
+        return changed
 
     def _corrupt(self, data: bytes) -> bytes:
         """Flip one to three bits."""
@@ -137,6 +140,7 @@ class Faults:
         return bytes(damaged)
 
     def _cut(self, data: bytes) -> bytes:
+        """Drop the end, at a random position."""
         return data[: self._random.randrange(len(data))]
 
     def _is_on(self, window: FaultWindow, time: float) -> bool:
@@ -151,27 +155,31 @@ class FaultFile(Section):
 
     def of(self, amplifier: str, *, begin: float) -> Faults:
         """Return the faults of an amplifier; begin: origin of their time scale [s]."""
-        own = [window for window in self.faults if window.amplifier in (None, amplifier)]
-        return Faults(own, begin=begin, seed=self.seed)
+        windows = [window for window in self.faults if window.amplifier in (None, amplifier)]
+        return Faults(windows, begin=begin, seed=self.seed)
 
 
 def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
     """Read a fault file; raises ConfigError with every problem, by file, line and key."""
     document = read_document(path)
     validation = Validation(document, FaultFile)
-    listed = document.data.get("faults")
-    for number, entry in enumerate(listed if isinstance(listed, list) else []):
-        name = entry.get("amplifier") if isinstance(entry, dict) else None
+    entries = document.data.get("faults")
+    if not isinstance(entries, list):
+        return validation.finish()
+    for number, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            continue
+        name = entry.get("amplifier")
         if isinstance(name, str) and name not in amplifiers:
-            known = ", ".join(sorted(amplifiers))
-            validation.add(("faults", number, "amplifier"), f"must be one of {known}, got {name!r}")
+            names = ", ".join(sorted(amplifiers))
+            validation.add(("faults", number, "amplifier"), f"must be one of {names}, got {name!r}")
     return validation.finish()
 
 
-def parse_fault(given: Mapping[str, Any]) -> FaultWindow:
+def parse_fault(values: Mapping[str, Any]) -> FaultWindow:
     """Parse one fault, with the keys of a fault file; raises InputError."""
     try:
-        return FaultWindow.model_validate(dict(given))
+        return FaultWindow.model_validate(dict(values))
     except ValidationError as error:
         key, problem = first_problem(error)
         raise InputError(f"{key}: {problem}") from None

@@ -1,6 +1,6 @@
 """Exit on signals while Python still loads, before anything needs an orderly shutdown.
 
-A KeyboardInterrupt at that time may be swallowed by a callback or print a traceback.
+A callback can swallow a KeyboardInterrupt at that time, or Python prints a traceback.
 """
 
 import os
@@ -15,9 +15,11 @@ _INTERRUPTED = 130
 def exit_on_signal() -> Iterator[None]:
     """Exit immediately with status 130 on SIGTERM and SIGINT."""
     numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda *_: os._exit(_INTERRUPTED)) for number in numbers]
+    former_handlers = {}
+    for number in numbers:
+        former_handlers[number] = signal.signal(number, lambda *_: os._exit(_INTERRUPTED))
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
+        for number, handler in former_handlers.items():
             signal.signal(number, handler)

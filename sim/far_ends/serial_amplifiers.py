@@ -1,9 +1,9 @@
 """The amplifiers' side of a serial line, without I/O: bytes in, bytes out.
 
-On a shared line amplifiers have one address each, and send no events.
+On a shared line each amplifier has an address of its own, and sends no events.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from drivers.protocol.definition import (
     BROADCAST,
@@ -41,15 +41,17 @@ class SerialAmplifiers(FarEnd):
         self._amplifiers = dict(amplifiers)
         self._send = send
         self._reader = FrameReader()
-        self._events = 0
-        self._heard = [*amplifiers.values()] if len(amplifiers) == 1 else []
-        for amplifier in self._heard:
-            amplifier.listeners.append(self._send_event)
+        self._event_count = 0
+        self._is_shared = len(amplifiers) != 1
+        if not self._is_shared:
+            for amplifier in amplifiers.values():
+                amplifier.listeners.append(self._send_event)
 
     def close(self) -> None:
         """Send no more events."""
-        for amplifier in self._heard:
-            amplifier.listeners.remove(self._send_event)
+        if not self._is_shared:
+            for amplifier in self._amplifiers.values():
+                amplifier.listeners.remove(self._send_event)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
@@ -61,9 +63,9 @@ class SerialAmplifiers(FarEnd):
                     self._take(frame, amplifier, now)
 
     def _take(self, frame: Frame, amplifier: AmplifierPort, now: float) -> None:
-        """Have a request carried out by an amplifier, and send the reply if it has one.
+        """Let an amplifier carry out a request, and send the reply if there is one.
 
-        One of another version, or with half a word, is refused.
+        A request of another version, or with half a word, is rejected.
         """
         version = NEUTRAL if frame.type == HELLO else VERSION
         is_for_all = frame.address == BROADCAST
@@ -75,24 +77,35 @@ class SerialAmplifiers(FarEnd):
             words = words_of(frame) if frame.type in BY_NUMBER else ()
             kind, reply = carry_out(amplifier, frame.type, words, now, is_for_all=is_for_all)
         except Refusal as refusal:
-            whole = unpack_words(frame.payload[: len(frame.payload) & ~1])
-            is_part = frame.version == VERSION and is_earlier_part(frame.type, whole)
-            kind, reply = NAK, () if is_part else nak_of(refusal, frame.type)
+            kind = NAK
+            reply = _nak_words(frame, refusal)
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
         if kind == _SET_ADDRESS:
-            self._amplifiers = {
-                words[0] if each is amplifier else address: each
-                for address, each in self._amplifiers.items()
-            }
+            self._move(amplifier, words[0])
         if reply and not is_for_all:
             kind |= REPLY_BIT
             payload = payload_of(kind, reply)
             self._send(encode_frame(frame._replace(kind=kind, payload=payload, version=version)))
 
+    def _move(self, amplifier: AmplifierPort, new_address: int) -> None:
+        """Give an amplifier another address; the order of the amplifiers stays."""
+        moved: dict[int, AmplifierPort] = {}
+        for address, present in self._amplifiers.items():
+            moved[new_address if present is amplifier else address] = present
+        self._amplifiers = moved
+
     def _send_event(self, event: Values, now: float) -> None:
         ((address, amplifier),) = self._amplifiers.items()
         if not amplifier.is_answering:
             return
-        self._events = (self._events + 1) & 0xFFFF
+        self._event_count = (self._event_count + 1) & 0xFFFF
         payload = pack_words(EVENT_RECORD.pack(event))
-        self._send(encode_frame(Frame(EVENT, address, self._events, payload, VERSION)))
+        self._send(encode_frame(Frame(EVENT, address, self._event_count, payload, VERSION)))
+
+
+def _nak_words(frame: Frame, refusal: Refusal) -> Sequence[int]:
+    """The words of a Nak to a request; none to a part of a set other than the last."""
+    whole_words = unpack_words(frame.payload[: len(frame.payload) & ~1])
+    if frame.version == VERSION and is_earlier_part(frame.type, whole_words):
+        return ()
+    return nak_of(refusal, frame.type)

@@ -19,6 +19,8 @@ from model.commands.options import (
 from model.errors import InputError
 from model.quantities import counted
 
+_MAX_NAMES = 4  # ERA names per row
+
 if TYPE_CHECKING:
     from controller.demo.demonstration import DemoRun, Scene
     from controller.demo.touch_rows import TouchRow
@@ -231,9 +233,6 @@ def _heading(threshold: str, *, has_latency: bool) -> str:
     columns = f" time  target / cm  others  {'ERAs':22} {pair}  {pair}"
     scale = f"{scale_in_words(threshold)}; contrasts are the lowest over all threshold sets"
     return "\n".join([scale, groups.rstrip(), units.rstrip(), columns, ""])
-
-
-_MAX_NAMES = 4  # ERA names per row
 
 
 def _line(row: "TouchRow", *, has_latency: bool) -> str:

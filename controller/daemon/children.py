@@ -31,6 +31,8 @@ from registry.threads import Backoff
 _MAX_PAUSE = 30.0  # s
 _TERMINATE_TIMEOUT = 0.3  # s
 _GATEWAY = ("controller.cli", "gateway")
+_READ_TIMEOUT = 60.0  # s; a plug-in or a lost network folder can hang
+_NICE = 10  # added to the daemon's niceness, so that its loop has priority
 
 _logger = logging.getLogger(__name__)
 
@@ -80,10 +82,6 @@ async def keep_gateway(options: list[str]) -> None:
         await asyncio.sleep(pause)
 
 
-_TIMEOUT = 60.0  # s; a plug-in or a lost network folder can hang
-_NICE = 10  # added to the daemon's niceness, so that its loop has priority
-
-
 def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
     """Read a configuration in a child process, for the frequencies of a table [Hz]; blocks.
 
@@ -103,7 +101,7 @@ def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
         stdout=subprocess.PIPE,
         start_new_session=True,  # Ctrl-C is handled by the daemon
     ) as process:
-        timer = threading.Timer(_TIMEOUT, expire)
+        timer = threading.Timer(_READ_TIMEOUT, expire)
         timer.start()
         try:
             config = _exchanged(process, frequencies)
@@ -119,7 +117,7 @@ def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
             status = process.wait()
             timer.cancel()
     if expired.is_set():
-        raise TimeoutError(f"reading {file} took longer than {_TIMEOUT:g} s")
+        raise TimeoutError(f"reading {file} took longer than {_READ_TIMEOUT:g} s")
     if status != 0:
         raise OSError(f"reading {file} failed with status {status}")
     if isinstance(config, DaemonConfig):
@@ -145,13 +143,14 @@ def _main() -> None:
         os.nice(_NICE)
     output = sys.stdout.buffer
     sys.stdout = sys.stderr  # for output of plug-ins
-    read: DaemonConfig | str
+    result: DaemonConfig | str
     try:
         frequencies = pickle.load(sys.stdin.buffer)  # noqa: S301  of the daemon
-        read = load_daemon_config(Path(sys.argv[1])).for_table(frequencies)
+        config = load_daemon_config(Path(sys.argv[1]))
+        result = config.for_table(frequencies)
     except InputError as error:
-        read = str(error)
-    pickle.dump(read, output)
+        result = str(error)
+    pickle.dump(result, output)
     output.flush()
 
 

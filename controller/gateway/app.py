@@ -109,17 +109,18 @@ class ErrorBody(ApiMessage):
 
 
 def openapi() -> dict[str, Any]:
-    """The description, OpenAPI 3.1."""
+    """Return the OpenAPI 3.1 description of the API."""
     params: set[type[ApiMessage]] = set()
     results: set[type[ApiMessage]] = {ErrorBody}
     for method in HTTP_METHODS.values():
         params.add(method.params)
         results.add(method.result)
-    models = []
-    models += [(model, "validation") for model in sorted(params, key=repr)]
-    models += [(model, "serialization") for model in sorted(results, key=repr)]
     references, definitions = models_json_schema(
-        models, ref_template="#/components/schemas/{model}"
+        [
+            *((model, "validation") for model in sorted(params, key=repr)),
+            *((model, "serialization") for model in sorted(results, key=repr)),
+        ],
+        ref_template="#/components/schemas/{model}",
     )
     paths = {}
     for name, method in HTTP_METHODS.items():

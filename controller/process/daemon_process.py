@@ -14,6 +14,9 @@ _STAGED = "~"  # appended to the socket's name until it listens
 _MAX_PATH = 107 - len(_STAGED)  # bytes in sockaddr_un
 _REMEDY = "set another socket: in the daemon's file"
 
+MIN_DESCRIPTORS = 64
+_MAX_DESCRIPTORS = 65_536
+
 
 def check_socket_path(path: Path) -> None:
     """Raise InputError for an invalid socket path."""
@@ -118,10 +121,6 @@ def _open_lock(file: Path) -> IO[str]:
         raise InputError(f"{file}: must be a file of this user; remove it or {_REMEDY}")
     os.fchmod(descriptor, 0o600)
     return os.fdopen(descriptor, "a+", encoding="utf-8")
-
-
-MIN_DESCRIPTORS = 64
-_MAX_DESCRIPTORS = 65_536
 
 
 def allow_many_descriptors() -> int:

@@ -24,6 +24,12 @@ from typing import Any
 
 from pythonjsonlogger.json import JsonFormatter
 
+_MAX_QUEUED = 2000  # lines
+_BURST = 5  # lines per logging call in a burst
+_RATE = 1.0  # 1/s after a burst
+_MAX_MESSAGE = 2000  # characters
+_CLOSE_TIMEOUT = 0.3  # s; a hanging disk must not delay the exit
+
 
 class RateLimiter:
     """Allows `per_second` actions per second, and a burst, by default as many; clock [s]."""
@@ -47,13 +53,6 @@ class RateLimiter:
             return False
         self._allowed -= 1
         return True
-
-
-_MAX_QUEUED = 2000  # lines
-_BURST = 5  # lines per logging call in a burst
-_RATE = 1.0  # 1/s after a burst
-_MAX_MESSAGE = 2000  # characters
-_CLOSE_TIMEOUT = 0.3  # s; a hanging disk must not delay the exit
 
 
 class LogFormatter(JsonFormatter):

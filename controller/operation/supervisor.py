@@ -4,10 +4,10 @@ Only the supervisor changes the operation. An event changes it (`step`), the con
 the resulting actions, and the outcome of each action at the amplifiers is the next event. Actions
 come before observers, which are called a moment later, each guarded (`DeferredCalls`).
 
-Actions run in tasks (`_spawn`), which nothing cancels: a caller that is cancelled, such as the
-request of a client that has left, stops waiting, and the task goes on to its end. `run` waits for
-all tasks before it returns. A stop does not wait for these tasks: its requests to the amplifiers
-are queued before the operation changes and before any task begins.
+Actions run in tasks of their own (`_spawn`). A caller that is cancelled, such as the request of a
+client that has left, stops waiting, but the task continues to its end. `run` waits for all tasks
+before it returns; only a cancellation of `run` ends them early. A stop does not wait for these
+tasks: its requests to the amplifiers are queued before the operation changes.
 
 The supervisor also runs the control loop, polls disarmed amplifiers, and opens lost ones again.
 """
@@ -101,11 +101,11 @@ class Supervisor:
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
     ) -> None:
-        # Not the epoch of a daemon before, whose clients may still be connected.
+        # Differs from the epochs of an earlier daemon, whose clients may reconnect.
         self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
         self.closing = asyncio.Event()
-        self._changed = asyncio.Event()  # to another state, since `run` has looked at it
+        self._changed = asyncio.Event()  # set by a change of state, cleared by `run`
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer = link_changed
         self._alive = alive
@@ -263,7 +263,7 @@ class Supervisor:
             await self._carry_out([Action.RECONNECT], self.operation.epoch)
 
     def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
-        """Run work in a task that nothing cancels, and that `run` waits for."""
+        """Run work in a task of its own, for which `run` waits."""
         task = asyncio.ensure_future(work)
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)

@@ -46,7 +46,7 @@ def init(
                 stream.write(text.encode())
     except OSError as error:
         raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
-    typer.echo(f"wrote {file}, to be edited, and {schema}")
+    typer.echo(f"wrote {file} (edit it) and {schema}")
     typer.echo(next_line("era", "config", "check", file))
 
 

@@ -35,7 +35,7 @@ def _own_losses() -> str:
         f"{100 * loss:g} % ({', '.join(f'`{name}`' for name in own if own[name] == loss)})"
         for loss in dict.fromkeys(own.values())
     ]
-    return f"Wood has higher losses: its default, by name, is {' or '.join(by_loss)} (assumed)."
+    return f"Wood has higher losses; the defaults are {' or '.join(by_loss)} (assumed)."
 
 
 def _types() -> str:

@@ -144,7 +144,7 @@ def plate_map(
     level_row = None
     if levels is not None:
         level_row = (
-            f"level    {levels.median:8.1f} dB SL in the median, "
+            f"level    {levels.median:8.1f} dB SL median, "
             f"{levels.on_99_percent:.1f} or more on 99 % of the points ({rig.threshold})"
         )
     rows: list[str | None] = [
@@ -476,7 +476,7 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
     rows |= {f"in free waves of {_frequency(key)}": each for key, each in in_waves.items()}
     for name, rigidity in rows.items():
         yield (
-            f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x "
+            f"    {name}  {rigidity:.4g} N m: bending frequencies x "
             f"{math.sqrt(rigidity / bonded):.3f}"
         )
     yield "homogeneous plate like it at the highest frequency"
@@ -505,7 +505,7 @@ def _in_gpa(moduli: dict[str, float]) -> str:
 def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
     """Yield the air gap behind a plate."""
     if air is None:
-        yield "    no air: a plate in a vacuum, unless air_gap is given"
+        yield "    no air_gap: computed in a vacuum"
     else:
         edges = "sealed" if air["closed"] else "open"
         yield f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}"

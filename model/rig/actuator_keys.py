@@ -168,7 +168,7 @@ class ActuatorSection(Section):
 
     foot: Foot = 0.0
     """Radius of its contact disc, 0 for a point; only the part on the plate counts.
-    Required from a stiffness of 1 MN/m: [points and
+    Required if the stiffness is 1 MN/m or more: [points and
     feet](../concepts/plate-model.md#points-and-feet).
     """
 
@@ -218,7 +218,7 @@ class EraSection(ActuatorSection):
     """
 
     kind: Literal["era"] = "era"
-    """An ERA, unless it is an [exciter](#exciters)."""
+    """`era`; use `exciter` for an [exciter](#exciters)."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)]
     """Stiffness of its spring, k_b."""
@@ -293,19 +293,19 @@ class ExciterSection(ActuatorSection):
     coil_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] | None = None
     """Mass m_c of the coil and its adhesive, which moves with the plate.
 
-    Default: of the type
+    Default: from `type`
     """
 
     weight: Annotated[float, Quantity(MASS, above=0, at_most=10)] | None = None
     """Mass M that moves when the coil is glued: the magnet, usually with the housing.
 
-    Default: of the type
+    Default: from `type`
     """
 
     resonance: Annotated[float, Quantity(FREQUENCY, above=0, at_most=2000)] | None = None
     """Resonance frequency of coil and magnet on the suspension, without current.
 
-    Default: of the type
+    Default: from `type`
     """
 
     resonance_is: Literal["free", "mounted"] | None = None
@@ -318,7 +318,7 @@ class ExciterSection(ActuatorSection):
     q: Annotated[float, Quantity(RATIO, above=0, at_most=1000)] | None = None
     """Mechanical quality factor at this resonance, without current (Qms).
 
-    Default: of the type
+    Default: from `type`
     """
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e9)] | None = None
@@ -330,19 +330,19 @@ class ExciterSection(ActuatorSection):
     force_factor: Annotated[float, Quantity(FORCE_FACTOR, above=0, at_most=1000)] | None = None
     """Force per current, Bl.
 
-    Default: of the type
+    Default: from `type`
     """
 
     resistance: Annotated[float, Quantity(RESISTANCE, above=0, at_most=1e4)] | None = None
     """Coil resistance R_e.
 
-    Default: of the type
+    Default: from `type`
     """
 
     inductance: Annotated[float, Quantity(INDUCTANCE, at_least=0, at_most=0.1)] | None = None
     """Coil inductance L.
 
-    Default: of the type, or 0
+    Default: from `type`, or 0
     """
 
     source_resistance: Annotated[float, Quantity(RESISTANCE, at_least=0, at_most=1e4)] = 0.1
@@ -351,7 +351,7 @@ class ExciterSection(ActuatorSection):
     power: Annotated[float, Quantity(POWER, above=0, at_most=1e4)] | None = None
     """Power in the coil at level 1, averaged over a sine: the rated power or less.
 
-    Default: of the type
+    Default: from `type`
     """
 
     clip: Annotated[float, Quantity(VOLTAGE, above=0, at_most=1000)] | None = None
@@ -360,7 +360,7 @@ class ExciterSection(ActuatorSection):
     excursion: Annotated[float, Quantity(LENGTH, above=0, at_most=0.1)] | None = None
     """Largest amplitude of the coil in the magnet, Xmax.
 
-    Default: of the type, or unlimited
+    Default: from `type`, or unlimited
     """
 
     magnet: Literal["free", "held"] = "free"

@@ -47,12 +47,12 @@ class RigBalance:
             loads = [load for name, load in self.loads.items() if self._kinds[name] == kind]
             newtons = f"{_span(min(loads), max(loads))} N"
             if kind == _EDGES:
-                parts.append(f"its edges with {newtons}")
+                parts.append(f"its edges ({newtons})")
             elif count == 1:
-                parts.append(f"1 {kind} with {newtons}")
+                parts.append(f"1 {kind} ({newtons})")
             else:
                 plural = "feet" if kind == "foot" else f"{kind}s"
-                parts.append(f"{counted(count, kind, plural=plural)} with {newtons} each")
+                parts.append(f"{counted(count, kind, plural=plural)} ({newtons} each)")
         return f"rests on {' and '.join(parts)}"
 
     def notes(self) -> Iterator[str]:

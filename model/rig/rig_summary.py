@@ -353,7 +353,7 @@ def plate_notes(rig: Rig) -> Iterator[str]:
     slide = math.inf if plate.laminate is None else slide_frequency(plate.laminate, high)
     if high >= slide / _FAR_FROM_SLIDING:
         yield (
-            f"plate.layers: at {slide:.3g} Hz they slide to and fro on their own, and change "
+            f"plate.layers: at {slide:.3g} Hz they slide back and forth on their own, and change "
             "their thickness little above, which is neglected: do not use results above "
             f"{slide / _FAR_FROM_SLIDING:.3g} Hz"
         )

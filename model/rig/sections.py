@@ -349,7 +349,7 @@ class PlateSection(Section):
     """
 
     measured_temperature: Temperature = STANDARD_TEMPERATURE
-    """Temperature at which the numbers of this file hold, i.e. when the plate was measured."""
+    """Temperature at which the numbers of this file hold: that of the plate's measurement."""
 
     humidity: Humidities | None = None
     """Lowest and highest relative humidity of use, such as [35 %, 65 %].
@@ -358,8 +358,8 @@ class PlateSection(Section):
     """
 
     measured_humidity: Humidity = STANDARD_HUMIDITY
-    """Relative humidity at which the numbers of this file hold, i.e. in the weeks before the plate
-    was measured."""
+    """Relative humidity at which the numbers of this file hold: that of the weeks before the
+    plate's measurement."""
 
     modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), MODES]
     """Natural frequency and loss factor of the lowest elastic modes of the free plate, ascending,
@@ -471,7 +471,7 @@ Ring = Annotated[list[Corner], Field(min_length=3, max_length=1000)]
 
 
 class SurfaceSection(Section):
-    """Surface given by modes of another program, instead of a plate."""
+    """Surface given by modes from another program, instead of a plate."""
 
     modes: FileName
     """File of its modes, relative to the rig file: universal, .npz or .csv; see
@@ -619,7 +619,7 @@ class SupportSection(Section):
     """Viscous damping, instead of a loss factor or in addition to a given one."""
 
     foot: Foot = 0.0
-    """Radius of its contact disc, 0 for a point; required from 1 MN/m."""
+    """Radius of its contact disc, 0 for a point; required if the stiffness is 1 MN/m or more."""
 
     along: Edges | None = None
     """`edges` for a support along all edges, such as foam tape, instead of `at`."""
@@ -802,8 +802,8 @@ class LimitsSection(Section):
 
     slew: Annotated[float, Quantity(SLEW, above=0, at_most=1e6)] | None = None
     """Maximum rise of a level; `2 %/ms` is from rest to full stroke in 50 ms. Ramps are lengthened
-    accordingly; an envelope that rises faster is rejected. The rise is measured from the lowest
-    level that can be playing, averaged over the ramp: a raised cosine is 1.6 times as steep in its
+    accordingly; an envelope that rises faster is rejected. The rise is an average over the ramp,
+    starting at the lowest level that can be playing; a raised cosine is 1.6 times as steep in its
     middle.
     """
 
@@ -855,7 +855,7 @@ class RigSection(Section):
             json_schema_input_type=SurfaceSection | str | None,
         ),
     ] = None
-    """Modes of another program, instead of a plate; see [surface](#surface).
+    """Modes from another program, instead of a plate; see [surface](#surface).
 
     Limits: a mapping, or a file of modes
     """
@@ -887,7 +887,7 @@ class RigSection(Section):
     """Amplifiers by name; see [amplifiers](#amplifiers)."""
 
     limits: LimitsSection = LimitsSection()
-    """Limits of commands; see [limits](#limits)."""
+    """Limits of drive commands; see [limits](#limits)."""
 
     uncertainty: UncertaintySection = UncertaintySection()
     """Uncertainty of the rig; see [uncertainty](#uncertainty)."""

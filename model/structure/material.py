@@ -131,7 +131,7 @@ class KnownMaterial:
     by_moisture: float = 0.0
     """Relative change of its moduli by moisture, a share of the dry mass; 0 for what takes none."""
 
-    weather: str = "none counted"
+    weather: str = "assumed to be none"
     """Source of both."""
 
     def of_thickness(self, thickness: float) -> Material:

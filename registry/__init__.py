@@ -1,1 +1,1 @@
-"""Shared by the packages of era-haptics: plug-ins by name, suggestions for mistyped names."""
+"""Basics that all packages share, such as plug-ins by name and suggestions for typing errors."""

@@ -1,4 +1,4 @@
-"""Files that a user names: only regular ones are opened, bounded, without waiting; and file locks.
+"""Open user-named files safely (regular files only, limited in size, never blocking); lock files.
 
 Locks exist on POSIX systems only. Wires, daemon, clients and gateway need them; the plate, its
 tables, answers and designs do not, and a missing module is explained (`posix_needed`).
@@ -40,7 +40,7 @@ def open_regular(path: Path, max_bytes: int) -> BinaryIO:
 
 
 def read_regular(path: Path, max_bytes: int) -> bytes:
-    """Read a file as a whole; raises OSError as `open_regular` does."""
+    """Read a whole file; raises OSError like `open_regular`."""
     with open_regular(path, max_bytes) as stream:
         content = stream.read(max_bytes + 1)
     if len(content) > max_bytes:  # of a length that no system states
@@ -75,7 +75,7 @@ _MODULES = frozenset(("fcntl", "pwd", "resource", "termios", "tty"))
 
 
 def lock(file: IO[Any]) -> None:
-    """Lock an open file, until it is closed or its process ends, however it ends.
+    """Lock an open file until it is closed or its process ends, even by a crash.
 
     Raises BlockingIOError if it is locked already, OSError if its file system does not lock.
     """
@@ -85,7 +85,7 @@ def lock(file: IO[Any]) -> None:
 
 
 def posix_needed(error: BaseException) -> str | None:
-    """What to do about a missing module of POSIX systems; None for every other error."""
+    """Return the remedy for a missing POSIX module; None for other errors."""
     if not isinstance(error, ModuleNotFoundError) or error.name not in _MODULES:
         return None
     return f"wires, daemon and clients need Linux or macOS (no module {error.name} here); use WSL"

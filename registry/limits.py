@@ -5,14 +5,14 @@ import math
 from dataclasses import dataclass
 
 MAX_CONTACTS = 20
-"""Most fingers: two people with ten each, or four with five; more are a forearm or a spill."""
+"""Maximum number of fingers: two people with ten, or four with five; more are an arm or a spill."""
 
 MAX_FINGERS = 10
 """Maximum number of fingers with effects unless a daemon file sets it: the fingers of one
 person."""
 
 MAX_CONTENTS = 6
-"""Most contents at the same time; with more, no plate has any contrast left."""
+"""Maximum number of simultaneous contents; with more, no plate has any contrast left."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class GuardLimits:
 
 
 MAX_FINGER_LOAD = 10.0
-"""Largest load of a finger, in fingertips; what loads a plate by more is a hand that rests."""
+"""Maximum load of a finger, in fingertips; a larger load is a resting hand."""
 
 HAND_LOAD, MAX_HAND_LOAD = 12.0, 40.0
 """Load of a resting hand of unknown size, in fingertips, and the maximum.

@@ -15,7 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
 _NEAR = 0.65
-"""Least similarity of a suggestion; `unobtainium` is not similar to `aluminium`."""
+"""Minimum similarity of a suggestion; `unobtainium` is not similar to `aluminium`."""
 
 
 def did_you_mean(name: str, known: Iterable[str], *, ending: str = "") -> str:
@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 _Made = TypeVar("_Made")
 
 EXAMPLE_PREFIX = "example"
-"""Names of the example plug-ins begin with it, names of this project never do."""
+"""Prefix of the example plug-ins' names; the project's own names never begin with it."""
 _OURS = "era-haptics"
 _GROUP_PREFIX = "era_haptics."
 _REMEDY = "repair or remove that package"
@@ -69,7 +69,7 @@ class PluginRegistry(Generic[_T]):
     example: str = ""
 
     def __post_init__(self) -> None:
-        """Keep the names of the examples free; raises ValueError."""
+        """Raise ValueError for a name that is reserved for the examples."""
         for name in self.own:
             if name.startswith(EXAMPLE_PREFIX):
                 raise ValueError(
@@ -104,7 +104,7 @@ class PluginRegistry(Generic[_T]):
         return EntryPoint(name, own, self.group).load() if isinstance(own, str) else own
 
     def make(self: "PluginRegistry[Callable[[str], _Made]]", url: str) -> _Made:
-        """Call the class that the scheme of a URL names with the URL; raises as `find` does.
+        """Call the class named by the scheme of a URL with the URL; raises like `find`.
 
         The class may raise `error` for a URL that it refuses. Schemes are case-insensitive.
         """
@@ -147,7 +147,7 @@ class PluginRegistry(Generic[_T]):
     def _attributed(
         self, point: EntryPoint, within: str, *, but: tuple[type[Exception], ...] = ()
     ) -> Iterator[None]:
-        """Convert exceptions of a plug-in to `error`, with its package; but: exceptions to pass."""
+        """Convert exceptions of a plug-in to `error` with its package; but: exceptions to keep."""
         try:
             yield
         except but:
@@ -180,7 +180,7 @@ def failure_text(error: BaseException) -> str:
 
 
 def failed_plugin(error: BaseException) -> EntryPoint | None:
-    """The plug-in of another package in whose code an error arose; None if it is ours."""
+    """Return the plug-in of another package whose code raised an error; None for our own code."""
     modules = [error.module] if isinstance(error, WrongResultError) else []
     trace = error.__traceback__
     while trace is not None:
@@ -219,7 +219,7 @@ def _found(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...
 
 @cache
 def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """Return one plug-in of each other package, by its top-level module."""
+    """Return one plug-in per other package, by top-level module."""
     points = [
         point
         for group in entry_points().groups

@@ -13,7 +13,7 @@ _MAX_CHARACTERS = 400
 
 
 class ServiceManager:
-    """The service manager that an environment names, if any."""
+    """Return the service manager named in an environment, if any."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
@@ -38,7 +38,7 @@ class ServiceManager:
         self.notify("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
 
     def alive(self, now: float) -> None:
-        """Feed systemd's watchdog if it is due at a time [s]; call it as long as all is well."""
+        """Feed systemd's watchdog if it is due at a time [s]; call it while all is well."""
         interval = self._watchdog_interval
         if interval is not None and now - self._last_alive >= interval:
             self._last_alive = now

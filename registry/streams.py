@@ -56,7 +56,7 @@ def _protected(stream: TextIO) -> TextIO:
 
 
 def drawing_on(stream: TextIO) -> TextIO:
-    """A stream to the same file without escapes, for libraries that draw on a terminal."""
+    """Return a stream to the same file without escapes, for libraries that draw on a terminal."""
     if not isinstance(stream, PrintableStream):
         return stream
     stream.flush()

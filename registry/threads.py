@@ -88,7 +88,7 @@ def _note_result(
 
 
 def are_at_work() -> bool:
-    """Whether a thread is at work for `in_thread`, or its result is not noted yet."""
+    """Whether `in_thread` has running work, or a result that is not stored yet."""
     return bool(_at_work)
 
 
@@ -105,7 +105,7 @@ def leave_work() -> None:
 
 
 class DaemonThreads(ThreadPoolExecutor):
-    """A pool for event loops, their own or another, with a daemon thread for each work."""
+    """Executor for event loops with a daemon thread for each work item."""
 
     def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
         """Start work immediately."""
@@ -128,7 +128,7 @@ async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
 
 
 class LoopThread:
-    """An event loop in a daemon thread of a name, until `close` or until nothing refers to it."""
+    """Event loop in a named daemon thread, until `close` or until nothing refers to it."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
@@ -223,14 +223,14 @@ def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[f
 
 
 class Backoff:
-    """Pauses [s] before restarts: each twice the previous one, the first again after a good run."""
+    """Pauses [s] before restarts: each twice the previous one, reset after a good run."""
 
     def __init__(self, first: float, maximum: float) -> None:
         self._bounds = first, maximum
         self._pauses = pauses(*self._bounds)
 
     def pause(self, *, ran_for: float) -> float:
-        """Return the pause before a restart of what ran for a time [s]."""
+        """Return the pause before the restart of a program that ran for a time [s]."""
         if ran_for >= GOOD_TIME:
             self._pauses = pauses(*self._bounds)
         return next(self._pauses)

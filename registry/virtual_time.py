@@ -45,7 +45,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
     @property
     def _clock_resolution(self) -> float:
-        """The smallest step: no timer fires early."""
+        """Resolution of the clock: the smallest step, so that no timer fires early."""
         return math.ulp(self.now)
 
     @_clock_resolution.setter

@@ -1,4 +1,4 @@
-"""Errors of pydantic and typer in the words of all other errors."""
+"""Reword errors of pydantic and typer like all other errors."""
 
 from typing import TYPE_CHECKING
 

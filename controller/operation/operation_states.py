@@ -22,7 +22,7 @@ from enum import Enum, StrEnum, auto
 from typing import NamedTuple, Self
 
 _REMEDIES = {
-    "WATCHDOG": "end programs that take the processor, or check the wire: it received nothing in "
+    "WATCHDOG": "stop programs that load the processor, or check the wire: no request arrived in "
     "time",
     "OVER_TEMPERATURE": "let it cool, check its ventilation",
     "OVER_VOLTAGE": "check its supply",

@@ -63,7 +63,7 @@ _MAX_READ_BACKS = 15
 _EPOCHS = 2**31  # a daemon starts at a random one; all are exact as JSON numbers
 
 LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
-_REOPENING = "the daemon reconnects by itself and stays disarmed"
+_REOPENING = "the daemon reconnects on its own and stays disarmed"
 _SILENT = (GroupState.DISARMED, GroupState.STOPPED)
 
 _LOG_LEVELS = {

@@ -30,8 +30,7 @@ from model.table.table import LocalizationTable
 from registry.plugins import failure_text
 
 ENDED = (
-    "the vibration has ended by itself: it was not renewed, or a limit of time was reached; touch "
-    "there again"
+    "the vibration has ended: it was not renewed, or a time limit was reached; touch there again"
 )
 
 _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; longest time without counting clocks while fingers change

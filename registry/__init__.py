@@ -1,1 +1,1 @@
-"""Basics that all packages share, such as plug-ins by name and suggestions for typing errors."""
+"""Basics that the packages of era-haptics share, such as plug-ins and typing suggestions."""

@@ -6,8 +6,8 @@ request; everything else runs between turns. A turn serves clients that touch or
 first, and waits while a touch is on its way to the wire. Connections whose input may contain a stop
 have separate turns that never wait.
 
-The number of clients is bounded. Additional clients get reserve connections, where only methods
-that silence are served, so that another client can always connect and `stop`. Slow methods, such as
+The number of clients is bounded. Additional clients get reserve connections, which serve only
+methods that silence, so that another client can always connect and `stop`. Slow methods, such as
 arming, run as tasks. `TOPICS` (`controller/api/methods.py`) defines how often each topic is sent.
 
 A request that silences is carried out before its other parts are checked, and counts towards no

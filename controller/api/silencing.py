@@ -1,8 +1,8 @@
 """Lenient parsing of requests that silence the plate: `stop` and `disarm`.
 
 A newer client must be able to stop an older daemon, and so must a client with a bug. A request that
-silences is therefore identified by its method alone, and is carried out in spite of any other
-error; the error is reported afterwards.
+silences is therefore identified only by the name of the method, and is carried out in spite of any
+other error; the error is reported afterwards.
 """
 
 import re

@@ -221,7 +221,7 @@ def _raised(finger: FingerTarget, others: Iterable[Content]) -> FingerTarget:
 def _among(question: Question, selection: Selection, frequencies: Sequence[float]) -> Selection:
     """Return the selection for a pulse among vibrations of some frequencies [Hz].
 
-    The pulse is mixed if it is nearer than 30 Hz to one of them.
+    The pulse is mixed if any of these frequencies is nearer than 30 Hz.
     """
     if not selection.contents:
         if selection.reason == LIMITS_LEAVE_NOTHING:

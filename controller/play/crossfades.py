@@ -171,7 +171,7 @@ class Crossfades:
 
 
 def _by_finger(contents: Iterable[Content]) -> _Voices:
-    """Return contents by finger, each followed by its side bands."""
+    """Return contents by finger, with side bands after their carrier."""
     voices = dict[ContactKey, tuple[Content, ...]]()
     for content in sorted(contents, key=lambda content: content.key.voice):
         key = content.key.finger
@@ -188,7 +188,7 @@ def _all_of(voices: _Voices) -> list[Content]:
 
 
 def _changes(goal: _Voices, playing: _Voices) -> _Voices:
-    """Return the contents of a goal that feel different from those that play."""
+    """Return the contents of a goal that feel different from the present contents."""
     changes = dict[ContactKey, tuple[Content, ...]]()
     for key, voices in goal.items():
         if _differ(voices, playing[key]):

@@ -62,7 +62,7 @@ class Pulse:
     """[s]"""
     is_raised: bool = True
     """Whether the drive is raised to reach the level over the duration, onset included; otherwise
-    the level is that of the steady vibration."""
+    the level applies to the steady vibration."""
     due_at: float = field(default=-math.inf, init=False, compare=False)
     """When [s] a pulse that waits its turn is due; other pulses are due when requested."""
     started_at: float | None = field(default=None, init=False, compare=False)
@@ -117,7 +117,7 @@ class Target:
 
     @property
     def voice(self) -> int:
-        """Its first voice; voices distinguish the contents of one finger."""
+        """Its first voice; voices distinguish contents at the same finger."""
         if self.is_short:
             return CLICK
         return 0
@@ -207,7 +207,7 @@ def contacts_of(targets: Targets) -> list[Contact]:
 
 
 def pulses_of(targets: Targets) -> list[Pulse]:
-    """Return the pulses of those targets that have one."""
+    """Return the pulses of targets with a limited duration."""
     return [target.pulse for _, target in targets if target.pulse is not None]
 
 
@@ -314,13 +314,13 @@ def _amplified(level: float | None, gain_db: float) -> float | None:
 
 @dataclass(frozen=True)
 class Content:
-    """The content of one layer, with the contacts as they were when it was chosen."""
+    """A content, which plays in its own layer, and its contacts when it was chosen."""
 
     key: ContentKey
     targets: Targets
     """The finger that owns it, followed by the fingers that share it."""
     placement: Placement
-    """Positions of these fingers and of all other fingers."""
+    """Positions of its fingers, followed by the positions of all other fingers."""
     layer: Layer
     """The layer of the model's answer, in phase with the content that it continues, with its
     gain."""

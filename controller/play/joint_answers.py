@@ -231,7 +231,7 @@ def playable_band(
 def _as_layers_allow(
     fingers: Sequence[Finger], target_count: int, capabilities: PlaybackCapabilities
 ) -> list[Finger]:
-    """Return fingers, of which those with low priority are steady if side bands have no layer left.
+    """Return fingers; stimuli with low priority are steady if their side bands have no free layer.
 
     One layer is left free for a click.
     """

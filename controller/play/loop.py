@@ -41,7 +41,7 @@ _logger = logging.getLogger(__name__)
 
 
 class Cycle:
-    """The control loop of one plate; contacts are followed while it waits, too.
+    """The control loop of a plate; it follows contacts even while it waits.
 
     group: all amplifiers, which are opened and armed elsewhere.
     """

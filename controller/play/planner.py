@@ -134,7 +134,7 @@ class Planner:
         return not self._tracker.contacts and not self.slots.is_silent
 
     def plan(self, now: float) -> Plan | None:
-        """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
+        """Plan at a time [s], after expired contacts were lifted; None if nothing changes."""
         self._drop_ended_pulses(now)
         contacts = self._tracker.contacts
         last_plan = self._last_plan
@@ -380,7 +380,7 @@ class Planner:
         return replace(plan, sets=Sets(endings), is_reported=False)
 
     def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
-        """Note how the amplifiers play sets by now [s].
+        """Note how the amplifiers play sets, which were committed before now [s].
 
         Pulses start when the last amplifier starts.
         """

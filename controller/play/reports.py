@@ -1,4 +1,4 @@
-"""Reports of the control loop: what the amplifiers play since a plan, and who gets the reports."""
+"""Reports of the control loop about the playback after a plan, and the observers of the loop."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,7 +24,7 @@ class PlayReport:
     time: float
     """When [s] that byte was sent, or the report made."""
     is_touch: bool = False
-    """As in the plan."""
+    """Whether the plan responds to a touch, not to lifts alone."""
     reason: str = ""
     """Why all channels are silent."""
     contents: Mapping[int, Slot] = field(default_factory=dict)
@@ -32,7 +32,7 @@ class PlayReport:
     quiet: tuple[Contact, ...] = ()
     """Contacts without a target, which are kept quiet."""
     quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
-    """Foreign levels at quiet contacts (`Selection.foreign_levels`), by the rig's set first."""
+    """Foreign levels at quiet contacts by threshold set (`Selection.foreign_levels`)."""
     settled_after: float = 0.0
     """Time [s] until the last fade or envelope has ended."""
 
@@ -80,20 +80,27 @@ def play_report(
             reason=reason,
         )
     selection = plan.selection
-    numbers = [number for number, slot in playing.items() if slot.content in selection.contents]
-    numbers.sort(key=plan.sets.started.__contains__)
+    continuing = dict[int, Slot]()
+    started = dict[int, Slot]()
+    for number, slot in playing.items():
+        if slot.content not in selection.contents:
+            continue
+        if number in plan.sets.started:
+            started[number] = replace(slot)
+        else:
+            continuing[number] = replace(slot)
+    quiet_levels = dict[ContactKey, Sequence[float]]()
+    for contact in selection.quiet:
+        quiet_levels[contact.key] = selection.foreign_levels.get(contact.key, ())
     return PlayReport(
         plan.contacts,
         selection.finger_sensations,
         latency=latency,
         time=now if sent_at is None else sent_at,
         is_touch=plan.is_touch,
-        contents={number: replace(playing[number]) for number in numbers},
+        contents={**continuing, **started},
         quiet=selection.quiet,
-        quiet_levels={
-            contact.key: selection.foreign_levels.get(contact.key, ())
-            for contact in selection.quiet
-        },
+        quiet_levels=quiet_levels,
         settled_after=plan.sets.settled_after,
     )
 

@@ -101,7 +101,7 @@ Drive = Mapping[str, AmplifierTone]
 """Tones by ERA, without silent ones."""
 
 PlateLayer = Mapping[str, AmplifierLayer]
-"""Contents of one layer on all amplifiers, by amplifier name."""
+"""A layer on all amplifiers, by amplifier name."""
 
 _logger = logging.getLogger(__name__)
 
@@ -479,7 +479,7 @@ def route(
         driven = excitation.get(name)
         shape = onsets.get(name)
         if driven is None:
-            # An ERA that falls silent while others play skips its ending: that is for all together.
+            # An ERA that falls silent while others play skips its ending, which all end along.
             frequency = rig.limits.frequency_min
             if onset and shape:
                 frequency = onset[name].frequency
@@ -487,7 +487,7 @@ def route(
                 channel.number, frequency, 0.0, 0.0, False, True, shape, endings.get(name)
             )
         else:
-            phase = driven.phase  # the ledger rejects one that is not finite
+            phase = driven.phase  # the ledger rejects infinite phases and NaN
             if math.isfinite(phase):
                 phase = math.degrees(math.remainder(phase, math.tau))
             tone = AmplifierTone(
@@ -500,16 +500,12 @@ def route(
                 ending=endings.get(name),
             )
         wired[channel.amplifier].append(tone)
-        rise = _rise(tone, drive.get(name))
-        if rise > largest_rise:  # false for NaN, which the ledgers reject
-            largest_rise = rise
-    shortest_ramp = largest_rise / rig.limits.slew
-    if shortest_ramp > ramp:
-        ramp = shortest_ramp
-    layers = dict[str, AmplifierLayer]()
-    for name, tones in wired.items():
-        layers[name] = AmplifierLayer(number, tuple(tones), ramp, valid_for)
-    return layers
+        # A rise of NaN, which the ledgers reject, changes nothing here.
+        largest_rise = max(largest_rise, _rise(tone, drive.get(name)))
+    ramp = max(ramp, largest_rise / rig.limits.slew)
+    return {
+        name: AmplifierLayer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()
+    }
 
 
 def _rise(tone: AmplifierTone, former_tone: AmplifierTone | None) -> float:
@@ -522,7 +518,8 @@ def _rise(tone: AmplifierTone, former_tone: AmplifierTone | None) -> float:
 def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
     """Return the frequencies [Hz] that restart at the commit because an ERA joins them.
 
-    All ERAs of one frequency must count its phase from the same moment, or their field changes.
+    All ERAs with the same frequency must count its phase from the same moment, or their field
+    changes.
     """
     return {
         tone.frequency

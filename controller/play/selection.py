@@ -91,7 +91,7 @@ def _is_met_by(intended: Question, chosen: Selection) -> bool:
 
 
 def _are_same_fingers(contacts: Iterable[Contact], chosen: Selection) -> bool:
-    """Whether contacts are the same as in a selection; fingers may have left a whole one."""
+    """Whether a selection has these contacts; fingers can have left a whole selection."""
     keys = {contact.key for contact in contacts}
     if not chosen.is_whole:
         return keys == chosen.contacts.keys()
@@ -371,7 +371,7 @@ class Selector:
         )
 
     def _felt_contents(self, pulses: Mapping[ContactKey, Selection]) -> dict[ContentKey, Content]:
-        """Return the lasting contents and those of some pulses, by finger and voice."""
+        """Return the lasting contents and the contents of some pulses, by finger and voice."""
         selections = [self._felt_lasting(), *pulses.values()]
         return {content.key: content for content in contents_of(selections)}
 

@@ -117,7 +117,7 @@ class Sets:
 class Slot:
     """A content in its layer; it starts, plays, gets its ending or pieces, is renewed, falls, ends.
 
-    `due` is the time of the next of these events. `replace` makes a copy that does not change.
+    `due` is the time of the next event. `replace` makes a copy that does not change.
     """
 
     content: Content
@@ -223,7 +223,7 @@ class Slots:
         return min([slot.ending_due for slot in self.by_layer.values()], default=math.inf)
 
     def plan(self, contents: Sequence[Content], now: float) -> Sets:
-        """Return the sets by which layers play these contents and no others from a time [s] on.
+        """Return the sets that let layers play only these contents from a time [s] on.
 
         Contents that play already do not change. If the ledgers refuse the sets, the contents are
         played along plain ramps; if they refuse these, too, without the newest content.
@@ -286,8 +286,8 @@ class Slots:
     def may_lead(self, contents: Sequence[Content], now: float) -> bool:
         """Whether the present contents can be cross-faded to these at a time [s].
 
-        Each content must replace one that plays. If its frequency differs it needs a free layer,
-        and the ledgers must admit both contents together.
+        Each content must replace a content that plays. If its frequency differs it needs a free
+        layer, and the ledgers must admit both contents together.
         """
         playing_keys = {slot.content.key for slot in self.by_layer.values()}
         second_layers = 0
@@ -391,7 +391,7 @@ class Slots:
         return all(self._may_end_shaped(number, now) for number in self.may_play)
 
     def confirm(self, sets: Sets, played: PlayedSet, now: float) -> None:
-        """Note how the amplifiers play sets that were committed by now [s].
+        """Note how the amplifiers play sets that were committed before now [s].
 
         A content that a ledger has shortened is not renewed, which would circumvent its limit. The
         second piece of a course is sent immediately, each later piece when half of the previous one
@@ -455,7 +455,7 @@ class Slots:
     def ended(self, now: float) -> tuple[Content, ...]:
         """Return the contents that have ended by themselves by a time [s], each once.
 
-        A course with a piece due, for which the host was late, continues.
+        A course continues if its next piece is due, because the host was late.
         """
         newly_ended = list[Content]()
         for number, slot in [*self.by_layer.items()]:
@@ -764,7 +764,7 @@ class Slots:
         return slot
 
     def _falling(self, number: int, contents: Sequence[Content], now: float) -> Slot | None:
-        """Return a layer's slot while one of these contents replaces it; None if it just ends."""
+        """Return a layer's slot while another content replaces it; None if it just ends."""
         slot = self.by_layer.get(number)
         if slot is None:
             return None
@@ -849,7 +849,7 @@ def _course_onset(
 
 
 def _requested_at(slot: Slot) -> float:
-    """When [s] a content was requested, by its pulse or its contact."""
+    """Return when [s] the pulse of a content was requested, or its contact came."""
     content = slot.content
     if content.target.pulse is None:
         return content.contact.since

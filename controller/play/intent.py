@@ -263,17 +263,13 @@ def beside_others(
     levels of all foreign contents there, these included, relative to the rig's own set first;
     offsets_db: the finger's own level by set, relative to the rig's set.
     """
-    beside = replace(
-        sensation,
-        foreign_level_db_sl=max(foreign_levels),
-        rig_foreign_level_db_sl=foreign_levels[0],
-    )
+    beside = replace(sensation, foreign_levels_db_sl=tuple(foreign_levels))
     if sensation.layer is None:
         return beside
     own_level = own_level_db_sl(sensation)
     promised = sensation.promised_contrast_db
     masking_levels = foreign_levels
-    if promised is not None and sensation.foreign_level_db_sl is not None:
+    if promised is not None and sensation.foreign_levels_db_sl:
         # The promised contrast is to foreign contents here, not to quiet fingers.
         promised_background = [own_level + offset - promised for offset in offsets_db]
         masking_levels = sums_db([promised_background, other_levels])
@@ -298,8 +294,7 @@ def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sen
         contrast_db=_amplified(sensation.contrast_db, contrast_gain),
         median_contrast_db=_amplified(sensation.median_contrast_db, contrast_gain),
         promised_contrast_db=_amplified(sensation.promised_contrast_db, contrast_gain),
-        foreign_level_db_sl=_amplified(sensation.foreign_level_db_sl, others_gain_db),
-        rig_foreign_level_db_sl=_amplified(sensation.rig_foreign_level_db_sl, others_gain_db),
+        foreign_levels_db_sl=_all_amplified(sensation.foreign_levels_db_sl, others_gain_db),
     )
     if own_level_db_sl(weaker) < 0 <= own_level_db_sl(sensation):
         return replace(weaker, verdict=HELD_BACK)
@@ -310,6 +305,10 @@ def _amplified(level: float | None, gain_db: float) -> float | None:
     if level is None:
         return None
     return level + gain_db
+
+
+def _all_amplified(levels: Sequence[float], gain_db: float) -> tuple[float, ...]:
+    return tuple([level + gain_db for level in levels])
 
 
 @dataclass(frozen=True)
@@ -451,9 +450,8 @@ class Selection:
     """Targets that feel nothing, with the reasons."""
     is_pending: bool = False
     """Whether the contents of some targets are still being chosen."""
-    foreign_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
-    """Levels [dB SL] of other contents at each contact, by threshold set, which 90 % of plates do
-    not exceed."""
+    foreign_levels: Mapping[ContactKey, tuple[float, ...]] = field(default_factory=dict)
+    """The sensation's `foreign_levels_db_sl` at each contact, targets and quiet contacts alike."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
     is_limited: bool = field(default=False, compare=False)
@@ -519,9 +517,9 @@ class Selection:
             others_gains = [gains[targets] for targets in gains if targets != content.targets]
             contents.append(content.weakened(gain, max(others_gains, default=gain)))
         largest_gain = max(gains.values())
-        foreign_levels = dict[ContactKey, Sequence[float]]()
+        foreign_levels = dict[ContactKey, tuple[float, ...]]()
         for key, levels in self.foreign_levels.items():
-            foreign_levels[key] = [level + largest_gain for level in levels]
+            foreign_levels[key] = _all_amplified(levels, largest_gain)
         return replace(self, contents=tuple(contents), foreign_levels=foreign_levels)
 
     def without(self, contents: Collection[Content], reason: str) -> "Selection":
@@ -541,7 +539,7 @@ class Selection:
 
         table: has the threshold sets.
         """
-        other_levels = dict[ContactKey, Sequence[float]]()
+        other_levels = dict[ContactKey, tuple[float, ...]]()
         foreign_levels = {**self.foreign_levels}
         for key in self.target_keys:
             levels = foreign_at(key, others)
@@ -657,14 +655,14 @@ class Question:
         return tuple(selections)
 
 
-def foreign_at(key: ContactKey, selections: Sequence[Selection]) -> list[float]:
+def foreign_at(key: ContactKey, selections: Sequence[Selection]) -> tuple[float, ...]:
     """Return the foreign levels [dB SL] of several selections at a contact, by threshold set."""
     levels = list[Sequence[float]]()
     for selection in selections:
         levels_by_set = selection.foreign_levels.get(key)
         if levels_by_set:
             levels.append(levels_by_set)
-    return sums_db(levels)
+    return tuple(sums_db(levels))
 
 
 def sums_db(levels: Sequence[Sequence[float]]) -> list[float]:

@@ -319,13 +319,17 @@ def selection_of(
     reason = None
     if not contents:
         reason = unserved[0].held_back
+    foreign_levels = dict[ContactKey, tuple[float, ...]]()
+    contacts = [*contacts_of(targets), *quiet]
+    for contact, sensation in zip(contacts, solution.fingers, strict=False):
+        foreign_levels[contact.key] = sensation.foreign_levels_db_sl
     return Selection(
         targets,
         quiet,
         tuple(contents),
         reason,
         tuple(unserved),
-        foreign_levels=_foreign_levels(solution, [*contacts_of(targets), *quiet]),
+        foreign_levels=foreign_levels,
         protected=question.protected,
     )
 
@@ -397,16 +401,6 @@ def _are_played(
         if content is None or content.frequency != layer.frequency:
             return False
     return True
-
-
-def _foreign_levels(
-    solution: Answer, contacts: Sequence[Contact]
-) -> dict[ContactKey, Sequence[float]]:
-    """Return the levels [dB SL] of other contents at contacts, by threshold set."""
-    levels = np.array(solution.tones.foreign_db_sl)
-    levels[np.isnan(levels)] = -math.inf  # at fingers that are neither targets nor quiet
-    keys = [contact.key for contact in contacts]
-    return dict(zip(keys, levels.tolist(), strict=False))
 
 
 def _why_unfelt(sensation: Sensation) -> str | None:

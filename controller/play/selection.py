@@ -589,7 +589,7 @@ def _joined(
         former_targets.append(FingerTarget(former_contact, target))
     target_keys = {contact.key for contact, _ in targets}
     quiet = list[Contact]()
-    foreign_levels = dict[ContactKey, Sequence[float]]()
+    foreign_levels = dict[ContactKey, tuple[float, ...]]()
     for contact in contacts:
         foreign_levels[contact.key] = foreign_at(contact.key, chosen)
         if contact.key not in target_keys:

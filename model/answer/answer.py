@@ -303,21 +303,33 @@ class Sensation:
     median_contrast_db: float | None = None
     """Median of the same contrast over the plates."""
     promised_contrast_db: float | None = None
-    foreign_level_db_sl: float | None = None
-    """Promised level of all other vibrations at the loudest point here, relative to the lowest
-    threshold.
+    foreign_levels_db_sl: tuple[float, ...] = ()
+    """Promised level of all other vibrations at the loudest point here, by threshold set.
 
-    The highest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`. Use it
-    to decide whether others can be felt, but do not compare it with this finger's own level.
+    The rig's own set comes first. Empty for a finger that neither feels a vibration nor is kept
+    quiet.
     """
-    rig_foreign_level_db_sl: float | None = None
-    """The same level relative to the rig's own threshold set, like the finger's own levels."""
     lowered_db: float = 0.0
     """Reduction below the requested level [dB]."""
     is_disturbing: bool = False
     """Whether the vibration is held back because of another finger's max_foreign_db_sl."""
     pauses: bool = False
     """Whether the vibration ends or is modulated."""
+
+    @property
+    def foreign_level_db_sl(self) -> float | None:
+        """Promised level of all other vibrations at the loudest point here, relative to the lowest
+        threshold.
+
+        The highest over the rig's threshold sets, up to 30 dB above `rig_foreign_level_db_sl`. Use
+        it to decide whether others can be felt, but do not compare it with this finger's own level.
+        """
+        return max(self.foreign_levels_db_sl, default=None)
+
+    @property
+    def rig_foreign_level_db_sl(self) -> float | None:
+        """The same level relative to the rig's own threshold set, like the finger's own levels."""
+        return next(iter(self.foreign_levels_db_sl), None)
 
     @property
     def is_foreign_felt(self) -> bool:
@@ -503,13 +515,10 @@ class Answer:
 
     def _sensation_of_others(self, finger: int, verdict: str) -> Sensation:
         """Return the levels of other vibrations at a finger, without any contrast."""
-        levels_by_set = self.tones.foreign_db_sl[finger]
-        return Sensation(
-            self.asked[finger],
-            verdict,
-            foreign_level_db_sl=_known(max(levels_by_set)),
-            rig_foreign_level_db_sl=_known(levels_by_set[0]),
-        )
+        levels_by_set = tuple(self.tones.foreign_db_sl[finger])
+        if math.isnan(levels_by_set[0]):
+            return Sensation(self.asked[finger], verdict)
+        return Sensation(self.asked[finger], verdict, foreign_levels_db_sl=levels_by_set)
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:

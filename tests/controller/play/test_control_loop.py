@@ -323,7 +323,7 @@ def test_powers_of_contents_add(
         layer=0,
         promised_level_db_sl=20.0,
         promised_contrast_db=contrast,
-        foreign_level_db_sl=foreign,
+        foreign_levels_db_sl=() if foreign is None else (foreign,),
     )
     foreign_levels = sums_db([[6.0], [-math.inf if foreign is None else foreign]])
     felt = judged(beside_others(alone, [6.0], foreign_levels), is_apart=True)

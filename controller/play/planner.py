@@ -7,17 +7,18 @@ The planner reads no clock and never waits. `controller.play.loop` sends its pla
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from controller.play.changes import ChangeTimes, WaitingChanges
 from controller.play.chooser import Chooser
-from controller.play.intent import Content, IntentSource, Pulse, Selection, no_layer_free
+from controller.play.intent import IntentSource, Pulse, Selection, no_layer_free
 from controller.play.routing import CountedClocks, PlaybackCapabilities
-from controller.play.selection import PendingChoice, Selector
+from controller.play.selection import Selector
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
 from controller.sources.contact_tracker import ContactTracker
-from controller.sources.touch import Contact, ContactKey
+from controller.sources.touch import Contact
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
 from drivers.protocol.definition import HEARTBEAT
@@ -34,9 +35,6 @@ ENDED = (
 )
 
 _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; longest time without counting clocks while fingers change
-
-ChangeTimes = Mapping[ContactKey | None, float]
-"""When [s] fingers changed, by contact; the key None is for the first finger that lifted."""
 
 _logger = logging.getLogger(__name__)
 
@@ -111,9 +109,7 @@ class Planner:
         self._last_selection: Selection | None = None  # including contents that limits left out
         self._planned_contacts: Sequence[Contact] = ()
         self._unstarted_pulses: dict[int, Pulse] = {}  # planned, but not started; by identity
-        self._refused_changes: ChangeTimes = {}  # of a plan that amplifiers refused
-        self._last_choice: PendingChoice | None = None
-        self._waiting_changes: dict[ContactKey | None, float] = {}  # wait for that choice
+        self._changes = WaitingChanges(tracker)
 
     @property
     def due(self) -> float:
@@ -145,9 +141,9 @@ class Planner:
                 return self._prolonged(last_plan, now)
             selected = self._select(contacts, now)
             if last_plan is not None and self._is_planned(selected, now):
-                self._take_answered_changes(())
+                self._changes.answered_by((), self._selector.pending)
                 return self._prolonged(last_plan, now)
-            self._wait_again_after_refusal(contacts)
+            self._changes.wait_again_after_refusal()
             selection, sets = self._playback_of(selected, now)
         except Exception as error:
             return self._plan_silence(error, contacts, former_slots, now)
@@ -194,7 +190,8 @@ class Planner:
         """Return the plan for a selection and its sets, and keep it as the last plan."""
         for pulse in self._pulses_in(sets.started):
             self._unstarted_pulses[id(pulse)] = pulse
-        answered = self._take_answered_changes(sets.started)
+        started = [self.slots.by_layer[number].content for number in sets.started]
+        answered = self._changes.answered_by(started, self._selector.pending)
         plan = Plan(contacts, selection, now, answered, sets, former_slots=former_slots)
         self._last_plan = plan
         return plan
@@ -231,19 +228,6 @@ class Planner:
         self._intent_due = intent.due(now)
         selection = self._selector.select(contacts, intent, self.capabilities, now=now)
         return selection.weakened(intent.gains_db)
-
-    def _wait_again_after_refusal(self, contacts: Sequence[Contact]) -> None:
-        """Let fingers wait again whose plan was refused, unless they have lifted."""
-        if not self._refused_changes:
-            return
-        contact_keys = {contact.key for contact in contacts}
-        changes: ChangeTimes = {
-            key: changed_at
-            for key, changed_at in self._refused_changes.items()
-            if key in contact_keys
-        }
-        self._tracker.wait_again(changes)
-        self._refused_changes = {}
 
     def _playback_of(self, selected: Selection, now: float) -> tuple[Selection, Sets | None]:
         """Return the playable part of a selection, and its sets; None if it has no contents."""
@@ -290,41 +274,6 @@ class Planner:
         if has_failed or not self.slots.have_settled(now):
             return self.slots.silence(FADE_RAMP, now)
         return self.slots.plan((), now)
-
-    def _take_answered_changes(self, started: Collection[int]) -> dict[ContactKey | None, float]:
-        """Return the changes of fingers that a plan with starting layers responds to.
-
-        These changes no longer wait. While contents are being chosen in the thread, the plan
-        responds only to lifts and to fingers whose pulses start. A lasting content that starts
-        comes from the previous choice, and responds to the changes that waited for that choice.
-        """
-        changes = self._tracker.changed
-        choice = self._selector.pending
-        waiting_changes = self._waiting_changes
-        if choice is None:
-            answered = {**changes, **waiting_changes}
-            changes.clear()
-            self._last_choice = None
-            self._waiting_changes = {}
-            return answered
-        contents = [self.slots.by_layer[number].content for number in started]
-        answered_keys: set[ContactKey | None] = {None, *_contact_keys_of_pulses(contents)}
-        answered = {
-            key: at for key, at in {**changes, **waiting_changes}.items() if key in answered_keys
-        }
-        if choice is self._last_choice:
-            changes.pop(None, None)
-            return answered
-        new_changes = {key: at for key, at in changes.items() if key not in answered_keys}
-        changes.clear()
-        has_lasting_start = any(not content.target.is_short for content in contents)
-        if has_lasting_start:
-            answered |= waiting_changes
-        else:
-            new_changes |= waiting_changes
-        self._last_choice = choice
-        self._waiting_changes = new_changes
-        return answered
 
     def _pulses_in(self, numbers: Iterable[int]) -> list[Pulse]:
         """Return the pulses that play in layers."""
@@ -406,7 +355,7 @@ class Planner:
             self._unstarted_pulses.clear()
         retry_at = now + RETRY if refusal.until is None else refusal.until
         self._retry_at = max(retry_at, now + HEARTBEAT)
-        self._refused_changes = plan.answered
+        self._changes.refused = plan.answered
         silence = self.slots.silence(FADE_RAMP, now)
         return replace(plan, sets=replace(silence, reason=str(refusal)), is_reported=True)
 
@@ -469,12 +418,3 @@ def _is_felt_alike(plan: Plan, last_plan: Plan | None) -> bool:
     """Whether the sensations of two plans are equal."""
     last_sensations = () if last_plan is None else last_plan.selection.finger_sensations
     return plan.selection.finger_sensations == last_sensations
-
-
-def _contact_keys_of_pulses(contents: Iterable[Content]) -> set[ContactKey]:
-    """Return the contacts that feel the short pulses among contents."""
-    keys = set[ContactKey]()
-    for content in contents:
-        if content.target.is_short:
-            keys.update(content.contact_keys)
-    return keys

@@ -229,8 +229,9 @@ class Amplifier:
     """The layers that were checked last, if this check can be used again."""
 
     # Stops
-    known: StopOutcome = UNREACHED
-    """Its possible output, apart from the evidence of statuses and watchdog."""
+    stop_outcome: StopOutcome = UNREACHED
+    """Its possible output after the last stop, without the evidence of statuses and watchdog;
+    `what_may_play` has the conclusion."""
     silence_cause: str | None = None
     """Why it is degraded: it did not reply to a request, and may still play."""
     silences: int = 0
@@ -436,7 +437,9 @@ class Amplifier:
         if name == "Arm":
             self._admitted = None
             self.may_be_armed = True
-            self.known = replace(self.known, is_confirmed=False, may_play_until=-math.inf)
+            self.stop_outcome = replace(
+                self.stop_outcome, is_confirmed=False, may_play_until=-math.inf
+            )
         elif name in _SILENCING:
             self._admitted = None
             if name == "Silence" and self._ledger is not None:
@@ -616,7 +619,7 @@ class Amplifier:
         return channels == len(status["levels"]) and not any(status["levels"])
 
     def what_may_play(self, cause: str = "") -> StopOutcome:
-        """Return how long it may still play.
+        """Return how long it may still play: the only place where that is decided.
 
         cause: why its state is unknown; by default the reason why it is mute or its line lost. An
         amplifier that confirmed a stop, and received neither Clear nor Arm since, is silent.
@@ -626,8 +629,8 @@ class Amplifier:
         """
         status = self.status
         status_at = self.status_at
-        until = self.known.may_play_until
-        if not self.known.is_confirmed:
+        until = self.stop_outcome.may_play_until
+        if not self.stop_outcome.is_confirmed:
             until = max(until, self.feeding.may_play_until)
         if status is not None and status_at is not None:
             is_armed = status["state"] == ENABLED
@@ -653,7 +656,9 @@ class Amplifier:
 
     def go_on_from(self, earlier: "Amplifier") -> None:
         """Adopt the state of the same amplifier from before its line was reopened."""
-        self.known = replace(earlier.what_may_play(), is_confirmed=earlier.known.is_confirmed)
+        self.stop_outcome = replace(
+            earlier.what_may_play(), is_confirmed=earlier.stop_outcome.is_confirmed
+        )
         self.may_be_armed = earlier.may_be_armed
 
     async def open(self) -> None:
@@ -826,7 +831,7 @@ class Amplifier:
         latch = status["latch"] if has_restarted else last_latch
         if self.silences != last_silences:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-        self.known = replace(self.known, is_confirmed=False)
+        self.stop_outcome = replace(self.stop_outcome, is_confirmed=False)
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)
 
     def stop(
@@ -874,8 +879,8 @@ class Amplifier:
                         status = await (request or self._request_stop(stop))
                         while _is_stopping(status, stop.latch):
                             if self.is_silent(status):
-                                self.known = StopOutcome(True, threads.now())
-                                return self.known
+                                self.stop_outcome = StopOutcome(True, threads.now())
+                                return self.stop_outcome
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status(Priority.STOP)
                     except Exception as error:  # the stop continues after any failure

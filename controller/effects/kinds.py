@@ -302,7 +302,7 @@ class Texture(Effect):
     """Speed below which nothing is felt."""
 
     fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
-    """Speed that reaches `level`; above `slow`."""
+    """Speed at which `level` is reached; above `slow`."""
 
     range: Annotated[float, Quantity(LEVEL, at_least=0, at_most=40)] = 14.0
     """Attenuation in dB below `level` at `slow`."""

@@ -71,20 +71,22 @@ def _pieces(
 ) -> tuple[IntArray, IntArray]:
     """Cut segments at the knots; return the segment and the interval of each piece (p,)."""
     first = np.searchsorted(knots, starts)
-    counts = np.searchsorted(knots, ends) - first
+    end = np.searchsorted(knots, ends)
+    counts = end - first
     total = int(counts.sum())
     if total > _MAX_OVERLAP:
         raise refusal(source, "has too many events that overlap; shorten them")
     segment = np.repeat(np.arange(len(starts)), counts)
-    first_piece = np.cumsum(counts) - counts
-    interval = np.arange(total) + (first - first_piece)[segment]
+    first_pieces = np.cumsum(counts) - counts
+    shifts = first - first_pieces
+    interval = np.arange(total) + shifts[segment]
     return segment, interval
 
 
 def _along(ends: FloatArray, shares: FloatArray) -> FloatArray:
     """Interpolate between the values (p, 2) at both ends of lines; shares (2, p): 0 to 1."""
-    start_values = ends[:, 0]
-    return start_values + shares * (ends[:, 1] - start_values)
+    first, last = ends.T
+    return np.asarray(first + shares * (last - first))
 
 
 def _added(levels: FloatArray, interval: IntArray, count: int) -> FloatArray:
@@ -108,10 +110,13 @@ def stretches_between(curve: Curve, knots: FloatArray) -> FloatArray:
     """Return a curve (2, n) just inside both ends of each interval between knots."""
     times, values = np.array(curve).T
     times = times.round(_DIGITS)
-    width = np.diff(knots)
-    early = np.interp(knots[:-1] + 0.25 * width, times, values)
-    late = np.interp(knots[:-1] + 0.75 * width, times, values)
-    return np.stack([1.5 * early - 0.5 * late, 1.5 * late - 0.5 * early])
+    starts = knots[:-1]
+    widths = np.diff(knots)
+    early = np.interp(starts + 0.25 * widths, times, values)
+    late = np.interp(starts + 0.75 * widths, times, values)
+    at_start = 1.5 * early - 0.5 * late
+    at_end = 1.5 * late - 0.5 * early
+    return np.stack([at_start, at_end])
 
 
 def _curve(knots: FloatArray, values: FloatArray) -> Curve:
@@ -124,21 +129,28 @@ def _curve(knots: FloatArray, values: FloatArray) -> Curve:
 
 def thinned_curve(times: FloatArray, values: FloatArray) -> Curve:
     """Return a curve without points that repeat another or are on the line between neighbours."""
+    has_new_time = np.diff(times) > 0
+    has_new_value = abs(np.diff(values)) > _SAME
     is_new = np.ones(len(times), bool)
-    is_new[1:] = (np.diff(times) > 0) | (abs(np.diff(values)) > _SAME)
+    is_new[1:] = has_new_time | has_new_value
     times = times[is_new]
     values = values[is_new]
     is_kept = np.ones(len(times), bool)
     if len(times) > 2:
         is_kept[1:-1] = _is_corner(times, values)
-    return tuple(zip(times[is_kept].tolist(), values[is_kept].tolist(), strict=True))
+    points = zip(times[is_kept].tolist(), values[is_kept].tolist(), strict=True)
+    return tuple(points)
 
 
 def _is_corner(times: FloatArray, values: FloatArray) -> FloatArray:
     """Whether each inner point (n - 2,) is at a step, or off the line between its neighbours."""
     gaps = np.diff(times)
+    gap_ahead = gaps[:-1]
+    gap_behind = gaps[1:]
+    is_step = (gap_ahead == 0) | (gap_behind == 0)
     width = times[2:] - times[:-2]
-    share = np.divide(gaps[:-1], width, out=np.zeros_like(width), where=width > 0)
-    straight = values[:-2] + share * (values[2:] - values[:-2])
-    is_step = (gaps[:-1] == 0) | (gaps[1:] == 0)
-    return np.asarray(is_step | (abs(values[1:-1] - straight) > _SAME))
+    share = np.divide(gap_ahead, width, out=np.zeros_like(width), where=width > 0)
+    first = values[:-2]
+    straight = first + share * (values[2:] - first)
+    distance = abs(values[1:-1] - straight)
+    return np.asarray(is_step | (distance > _SAME))

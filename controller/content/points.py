@@ -35,13 +35,14 @@ def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
         raise InputError(f"points and taps must be 1 to {MAX_GIVEN} together, got {count}")
     _check_points("points", points)
     _check_points("taps", taps)
-    ends = [time for time, _, _ in (*points[-1:], *taps[-1:])]
-    return Pattern(
-        max(ends),
-        [(time, intensity) for time, intensity, _ in points],
-        [(time, sharpness) for time, _, sharpness in points],
-        tuple(Transient(*tap) for tap in taps),
-    )
+    intensity_curve = []
+    sharpness_curve = []
+    for time, intensity, sharpness in points:
+        intensity_curve.append((time, intensity))
+        sharpness_curve.append((time, sharpness))
+    transients = tuple(Transient(*tap) for tap in taps)
+    duration = max([time for time, _, _ in (*points[-1:], *taps[-1:])])
+    return Pattern(duration, intensity_curve, sharpness_curve, transients)
 
 
 def _check_points(name: str, points: Given) -> None:
@@ -79,7 +80,8 @@ def points_of(pattern: Pattern) -> tuple[list[_Point], list[_Point]]:
         times = np.linspace(times[0], times[-1], max_points)
         levels = curve_at(pattern.intensity, times)
     sharpness = curve_at(pattern.sharpness, times)
-    return [*zip(times.tolist(), levels.tolist(), sharpness.tolist(), strict=True)], taps
+    points = zip(times.tolist(), levels.tolist(), sharpness.tolist(), strict=True)
+    return list(points), taps
 
 
 def _joint_points(intensity: Curve, sharpness: Curve) -> tuple[FloatArray, FloatArray]:

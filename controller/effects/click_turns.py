@@ -37,7 +37,8 @@ class ClickTurns:
         if math.isinf(pulse.due_at):
             self._line_up(key, pulse)
         if self._waiting.get(key) is not pulse:
-            return math.inf if math.isinf(pulse.due_at) else now
+            has_had_turn = math.isfinite(pulse.due_at)
+            return now if has_had_turn else math.inf
         last_start = self._last_start_of_others(key)
         # The last pulse can have started later than it was due.
         pulse.due_at = max(pulse.due_at, last_start + CLICKS_APART)

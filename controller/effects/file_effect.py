@@ -177,7 +177,7 @@ class _FileRun(EffectRun):
                 change = min(change, self._click.pulse.end)
             else:
                 self._click = None
-        until = change if change < math.inf else None
+        until = None if math.isinf(change) else change
         if self._continuous is not None:
             return replace(self._continuous, until=until, click=self._click)
         if self._click is not None:

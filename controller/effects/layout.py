@@ -82,9 +82,10 @@ class SurfaceLayout:
 
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return the layout for the frequencies of a table [Hz], with its effects prepared."""
-        effects = {name: effect.for_table(frequencies) for name, effect in self.effects.items()}
-        for effect in effects.values():
-            effect.prepare(effect.level_db_sl)
+        effects = {}
+        for name, effect in self.effects.items():
+            effects[name] = effect.for_table(frequencies)
+            effects[name].prepare(effect.level_db_sl)
         for region, _, name in self.uses():
             effects[name].prepare(self.level_of(name, region))
         return replace(self, effects=effects)
@@ -114,7 +115,9 @@ class SurfaceLayout:
         problems: dict[str, None] = {}  # in order, each once
         for region, _, name in self.uses():
             band = self.effects[name].band_in(region)
-            problem = None if band is None else band_problem(band, frequencies)
+            if band is None:
+                continue
+            problem = band_problem(band, frequencies)
             if problem is not None:
                 area = ELSEWHERE if region is None else region.name
                 problems[f"{area}: {problem}"] = None
@@ -246,7 +249,9 @@ def _effects(
             validation.add(path, "means no effect where an effect is named; choose another name")
             continue
         kind = _kind_of(validation, name, parameters)
-        effect = None if kind is None else validation.nested(path, kind, without="kind")
+        if kind is None:
+            continue
+        effect = validation.nested(path, kind, without="kind")
         effects[name] = effect
         if effect is None:
             continue

@@ -184,7 +184,9 @@ class EffectPlayer:
     def effect_of(self, key: ContactKey) -> str | None:
         """Return the name of the effect that plays at a finger, or None."""
         finger = self._fingers.get(key)
-        return finger.plays[-1].name if finger and finger.plays else None
+        if finger is None or not finger.plays:
+            return None
+        return finger.plays[-1].name
 
     def play(
         self,

@@ -515,7 +515,7 @@ def difference_rows(verdict: Verdict) -> list[str]:
     if verdict.about("form"):
         within, changes = "", "in a way that no parameter describes"
     return [
-        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
+        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; the plate keeps "
         f"{percent(kept)} of the promises of the rig's table: calibrate it with "
         "`era calibrate`"
     ]

@@ -20,8 +20,8 @@ class GuardLimits:
     """Limits of one amplifier: mechanical frequency [Hz] and level (1 is full stroke).
 
     slew [1/s]: highest rise of a level; power: sum of squared levels over all channels; on_time
-    [s]: longest vibration without a pause; duty: fraction of any ten seconds; rate [1/s]: of
-    command sets that are not silent. All of these are unlimited by default.
+    [s]: longest vibration without a pause; duty: fraction of any ten seconds; rate [1/s]:
+    command sets per second, except silent ones. All of these are unlimited by default.
     """
 
     frequency_min: float

@@ -240,11 +240,11 @@ async def stop_times(session: Session, touches: int) -> str:
 
 _Act: TypeAlias = Callable[[Session, int], Awaitable[str]]
 FURTHER: Sequence[tuple[str, str, _Act, tuple[tuple[str, int], ...]]] = (
-    ("processor, ten moving fingers at 60 Hz", "4 ERAs on 1", moving, ()),
-    ("processor, one resting finger", "16 on 4", resting, ()),
+    ("processor time, ten moving fingers at 60 Hz", "4 ERAs on 1", moving, ()),
+    ("processor time, one resting finger", "16 on 4", resting, ()),
     ("stops of new clients while 200 reconnect", "4 ERAs on 1", fresh, (RECONNECTING,)),
     (
-        "touch of the lease's holder under floods, round trip",
+        "round trip of a touch by the client with the lease, under floods",
         "4 ERAs on 1",
         trips,
         (SLOW, MALFORMED, RECONNECTING),

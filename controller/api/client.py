@@ -285,9 +285,9 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     async def armed(
         self, owner: str, *, lease_s: float = DEFAULT_LEASE
     ) -> AsyncIterator[ArmResult]:
-        """Armed within the block, disarmed after it; the lease is renewed meanwhile.
+        """Arm for the duration of a `with` block, and renew the lease meanwhile.
 
-        Raises LeaseLost at the next call and at the end of the block once the lease is lost.
+        Once the lease is lost, the next call and the end of the block raise LeaseLost.
         """
         arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
         try:
@@ -629,9 +629,9 @@ class Client(AbstractContextManager["Client"]):
 
     @contextmanager
     def armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> Iterator[ArmResult]:
-        """Armed within the block, disarmed after it; the lease is renewed meanwhile.
+        """Arm for the duration of a `with` block, and renew the lease meanwhile.
 
-        Raises LeaseLost at the next call and at the end of the block once the lease is lost.
+        Once the lease is lost, the next call and the end of the block raise LeaseLost.
         """
         armed = self._client.armed(owner, lease_s=lease_s)
         with ExitStack() as end:

@@ -41,7 +41,7 @@ def demo(
         typer.Option(
             help="Wire to the amplifiers: sim (no wire, in this process), or in real time serial "
             "(pseudo-terminal), modbus (TCP), can (socketcand) or firmware (the C amplifier "
-            "on serial, after `make firmware`; its plate does not move). Default: sim, or "
+            "on serial, after `make firmware`; the plate then does not move). Default: sim, or "
             "serial in real time.",
             show_default=False,
         ),

@@ -233,7 +233,7 @@ def in_metres(x: float, y: float, *, length: float, width: float) -> str:
         sides = ((x, length), (y, width))
         if all(at == 0 or 1 <= at <= count * side for at, side in sides):
             return (
-                f"; positions are in metres: for {x:g} {unit}, {y:g} {unit} give "
+                f"; positions are in metres: for {x:g} {unit}, {y:g} {unit} write "
                 f"{x / count:g},{y / count:g}"
             )
     return ""

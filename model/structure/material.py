@@ -254,8 +254,9 @@ _KNOWN = (
         "addition to the plate's loss factor",
         by_frequency=((10.0, 4.2 / 4.6, 0.075), (100.0, 1.0, 0.06), (1000.0, 5.0 / 4.6, 0.045)),
         by_kelvin=-0.004,
-        weather="from its modulus over frequency, a decade for 21 K: activation energy of the beta "
-        "relaxation 78 kJ/mol, from memory; its loss factor then rises by 1.2 % per kelvin",
+        weather="derived from the modulus over frequency (21 K correspond to a decade): "
+        "activation energy of the beta relaxation 78 kJ/mol, from memory; its loss factor then "
+        "rises by 1.2 % per kelvin",
     ),
     KnownMaterial(
         Material("polycarbonate", E=2.4e9, rho=1200.0, nu=0.38),

@@ -714,24 +714,24 @@ _LINE_STYLES = ("-", "--", "-.")
 
 def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     """Draw the distribution of contrast over contact sets of 1, 2 and 3 other fingers."""
-    figure = Figure(figsize=(5.9, 3.8), layout="constrained")
+    figure = Figure(figsize=(6.0, 3.9), layout="constrained")
     axes = figure.subplots()
     for others, (promised, _) in enumerate(overview.contrasts, start=1):
         contrasts = np.sort(promised)
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
-        label = f"{others} other finger{'s' if others > 1 else ''}"
+        label = f"{others}"
         if len(contrasts):
             label += f": median {np.median(contrasts):.1f} dB"
         style = _LINE_STYLES[(others - 1) % len(_LINE_STYLES)]
         axes.step(contrasts, 100 * share, where="pre", ls=style, lw=1.8, label=label)
-    axes.axvline(WANTED_CONTRAST_DB, color="0.4", ls=":", lw=1.2)
-    axes.text(WANTED_CONTRAST_DB + 0.2, 96, f"{WANTED_CONTRAST_DB:g} dB", color="0.3", fontsize=9)
+    wanted = f"{WANTED_CONTRAST_DB:g} dB"
+    axes.axvline(WANTED_CONTRAST_DB, color="0.4", ls=":", lw=1.2, label=wanted)
     axes.set_xlim(left=0)
     axes.set_ylim(0, 100)
     axes.set_xlabel(_CONTRAST)
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
-    axes.legend(loc="upper right", fontsize=9)
+    axes.legend(loc="upper right", fontsize=9, title="other fingers")
     axes.set_title(f"Drive mode {table.drive_mode}: contacts at least 5 cm apart", fontsize=11)
     return figure
 

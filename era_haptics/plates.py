@@ -339,7 +339,7 @@ def draw_playback(playback: PlatePlayback) -> "Figure":
         axes.plot(1000 * times, peaks @ record.weights, label=f"target {number}", lw=2)
     for number, record in enumerate(playback.quiet, start=1):
         times, peaks = _peaks(record, period)
-        axes.plot(1000 * times, peaks.max(axis=1), label=f"quiet {number}", lw=1.2)
+        axes.plot(1000 * times, peaks.max(axis=1), label=f"quiet {number}", lw=1.2, ls="--")
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter("{x:g}")

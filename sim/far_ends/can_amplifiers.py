@@ -1,7 +1,7 @@
 """The amplifiers' side of CAN: CANopen nodes on a bus within this process, and adapters to it.
 
 Objects of a node are read and written by SDO (CiA 301). 2000 has the identity: four texts, then the
-versions. 2001 and 2002 have the words of the replies to GetCaps and GetStatus, a subindex each.
+versions. 2001 and 2002 have the words of the replies to GetCaps and GetStatus, one per subindex.
 Uploads are expedited or segmented, downloads expedited; no object that can be written is longer
 than four bytes. Far ends exchange packed frames (`drivers.wires.can_frames`), all frames of a
 message together.
@@ -81,58 +81,66 @@ class ObjectServer:
         self._amplifier = amplifier
         self._node = node
         self.heartbeat: int = CANOPEN["heartbeat_ms"]
-        self._object = (0, 0)
-        self._rest: bytes | None = None  # of an upload
+        self._object = (0, 0)  # index and subindex of the transfer
+        self._unsent: bytes | None = None  # end of a segmented upload
         self._toggle = 0
 
     def reply(self, data: bytes, now: float) -> bytes:
-        """Return the reply to a request at a time [s]; none to frames of other than eight bytes."""
+        """Return the reply to a request at a time [s]; empty if the frame has not eight bytes."""
         if len(data) != BLOCK:
             return b""
-        command = data[0] >> 5
         try:
-            if command in (_DOWNLOAD, _UPLOAD):
-                self._rest = None
-                self._object = struct.unpack_from("<HB", data, 1)
-            if command == _DOWNLOAD and data[0] & _EXPEDITED:
-                length = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
-                self._write(*self._object, data[4 : 4 + length], now)
-                return struct.pack("<BHB4x", 0x60, *self._object)
-            if command == _UPLOAD:
-                return self._begin_upload(now)
-            if command == _UPLOAD_SEGMENT and self._rest is not None:
-                return self._upload_segment(self._rest, data[0] >> 4 & 1)
-            if command != _ABORT:
-                raise SdoAbort(UNKNOWN_COMMAND)
+            return self._carry_out(data, now)
         except SdoAbort as abort:
-            self._rest = None
+            self._unsent = None
             return struct.pack("<BHBL", 0x80, *self._object, *abort.args)
-        self._rest = None
+
+    def _carry_out(self, data: bytes, now: float) -> bytes:
+        """Return the reply to a request of eight bytes, empty to an abort; raises SdoAbort."""
+        command = data[0] >> 5
+        if command in (_DOWNLOAD, _UPLOAD):
+            self._unsent = None
+            self._object = struct.unpack_from("<HB", data, 1)
+        if command == _DOWNLOAD and data[0] & _EXPEDITED:
+            return self._download(data, now)
+        if command == _UPLOAD:
+            return self._begin_upload(now)
+        if command == _UPLOAD_SEGMENT and self._unsent is not None:
+            return self._upload_segment(self._unsent, data[0] >> 4 & 1)
+        if command != _ABORT:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        self._unsent = None
         return b""
+
+    def _download(self, data: bytes, now: float) -> bytes:
+        length = 4
+        if data[0] & 1:  # the length is given
+            length -= data[0] >> 2 & 3
+        self._write(*self._object, data[4 : 4 + length], now)
+        return struct.pack("<BHB4x", 0x60, *self._object)
 
     def _begin_upload(self, now: float) -> bytes:
         value = self.read(*self._object, now)
         if 1 <= len(value) <= 4:
             command = 0x43 | (4 - len(value)) << 2
             return struct.pack("<BHB4s", command, *self._object, value)
-        self._rest, self._toggle = value, 0
+        self._unsent = value
+        self._toggle = 0
         return struct.pack("<BHBL", 0x41, *self._object, len(value))
 
-    def _upload_segment(self, rest: bytes, toggle: int) -> bytes:
+    def _upload_segment(self, unsent: bytes, toggle: int) -> bytes:
         if toggle != self._toggle:
             raise SdoAbort(TOGGLE)
-        piece, is_last = rest[:7], len(rest) <= 7
+        segment = unsent[:7]
+        is_last = len(unsent) <= 7
         self._toggle ^= 1
-        self._rest = None if is_last else rest[7:]
-        return struct.pack("<B7s", toggle << 4 | (7 - len(piece)) << 1 | is_last, piece)
+        self._unsent = None if is_last else unsent[7:]
+        command = toggle << 4 | (7 - len(segment)) << 1 | is_last
+        return struct.pack("<B7s", command, segment)
 
     def read(self, index: int, subindex: int, now: float) -> bytes:
         """Read an object at a time [s]; raises SdoAbort."""
         entries = self._entries(index, now)
-        if not isinstance(entries, list):
-            entries = [entries]
-        else:
-            entries.insert(0, bytes([len(entries)]))
         if subindex >= len(entries):
             raise SdoAbort(NO_SUBINDEX)
         return entries[subindex]
@@ -145,8 +153,15 @@ class ObjectServer:
             raise SdoAbort(BAD_LENGTH)
         self.heartbeat = int.from_bytes(data, "little")
 
-    def _entries(self, index: int, now: float) -> bytes | list[bytes]:
-        """Return an object, or its subindices from 1 on."""
+    def _entries(self, index: int, now: float) -> list[bytes]:
+        """Return the subindices of an object: its value, or their number and then the values."""
+        value = self._value(index, now)
+        if isinstance(value, list):
+            return [bytes([len(value)]), *value]
+        return [value]
+
+    def _value(self, index: int, now: float) -> bytes | list[bytes]:
+        """Return an object without subindices, or a list of its subindices from 1 on."""
         identity = self._amplifier.identity
         match _NAMES.get(index):
             case "device_type":
@@ -158,8 +173,13 @@ class ObjectServer:
             case "heartbeat_producer":
                 return self.heartbeat.to_bytes(2, "little")
             case "identity":
-                numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
-                return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
+                serial_number = zlib.crc32(identity["serial_number"].encode())
+                return [
+                    _u32(CANOPEN["vendor_id"]),
+                    _u32(CANOPEN["product_code"]),
+                    _u32(CANOPEN["revision"]),
+                    _u32(serial_number),
+                ]
             case "texts":
                 texts = [identity[field.name].encode() for field in TEXTS]
                 return [*texts, identity["versions"].to_bytes(2, "little")]
@@ -180,16 +200,18 @@ def _u32(value: int) -> bytes:
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
 _NMT_STATES: Mapping[str, int] = CANOPEN["nmt_states"]
-_OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
-_BOOT_UP, _PRE_OPERATIONAL = _NMT_STATES["BOOT_UP"], _NMT_STATES["PRE_OPERATIONAL"]
+_OPERATIONAL = _NMT_STATES["OPERATIONAL"]
+_STOPPED = _NMT_STATES["STOPPED"]
+_BOOT_UP = _NMT_STATES["BOOT_UP"]
+_PRE_OPERATIONAL = _NMT_STATES["PRE_OPERATIONAL"]
 _LEADS_TO = {
     _NMT["stop"]: _STOPPED,
     **dict.fromkeys((_NMT["pre_operational"], _NMT["reset_communication"]), _PRE_OPERATIONAL),
 }
-"""The state in which a node no longer takes requests, by the command that leads there."""
+"""The state in which a node no longer accepts requests, by the command that leads there."""
 _NMT_LENGTH = 2
 _SET_ADDRESS = MESSAGES["SetAddress"].number
-_POLL = 0.05  # s; between looks whether a heartbeat is wanted again
+_POLL = 0.05  # s; between checks whether the heartbeat has been switched on again
 
 
 class CanAmplifiers(FarEnd):
@@ -230,7 +252,7 @@ class _Node:
         self._was_faulty = False
         self._heartbeat_due = 0.0
         self._reset()
-        amplifier.listeners.append(self._tell)
+        amplifier.listeners.append(self._send_event)
 
     def _reset(self) -> None:
         self._state = _PRE_OPERATIONAL
@@ -262,27 +284,40 @@ class _Node:
 
     def take(self, frame: CanFrame, now: float) -> None:
         """Take a frame of another device; a message without a node number is for all nodes."""
-        data, sender, is_operational = frame.data, self._number, self._state == _OPERATIONAL
         if not self._amplifier.is_answering:
             return
-        if frame.id == cob_id("nmt") and len(data) == _NMT_LENGTH and data[1] in (0, sender):
-            self._command(data[0], now)
-        elif frame.id == cob_id("sdo_request", sender) and self._state != _STOPPED:
-            if reply := self._objects.reply(data, now):
-                self._put(cob_id("sdo_answer", sender), reply)
-        elif is_operational and (requests := self._requests.get(frame.id)) is not None:
-            if (message := requests.add(data, now)) is None:
-                return
-            number, kind, words = message
-            kind, reply_words = carry_out(
-                self._amplifier, kind, words, now, is_for_all=not number, address_max=NODE_MAX
-            )
-            if number and reply_words:
-                self._put(REPLY + sender, *segments(number, kind, reply_words))
-            if kind == _SET_ADDRESS:
-                self._number = words[0]
-            if self._number != sender:
-                self.boot(now)
+        data = frame.data
+        if frame.id == cob_id("nmt"):
+            if len(data) == _NMT_LENGTH and data[1] in (0, self._number):
+                self._command(data[0], now)
+        elif frame.id == cob_id("sdo_request", self._number):
+            if self._state != _STOPPED:
+                self._serve_object(data, now)
+        elif self._state == _OPERATIONAL and frame.id in self._requests:
+            self._take_request(self._requests[frame.id], data, now)
+
+    def _serve_object(self, data: bytes, now: float) -> None:
+        """Reply to a request of SDO."""
+        reply = self._objects.reply(data, now)
+        if reply:
+            self._put(cob_id("sdo_answer", self._number), reply)
+
+    def _take_request(self, requests: Assembler, data: bytes, now: float) -> None:
+        """Take a segment of a request, carry out the request if complete, and reply."""
+        message = requests.add(data, now)
+        if message is None:
+            return
+        number, kind, words = message
+        kind, reply_words = carry_out(
+            self._amplifier, kind, words, now, is_for_all=not number, address_max=NODE_MAX
+        )
+        node = self._number
+        if number and reply_words:
+            self._put(REPLY + node, *segments(number, kind, reply_words))
+        if kind == _SET_ADDRESS:
+            self._number = words[0]
+        if self._number != node:
+            self.boot(now)
 
     def _command(self, command: int, now: float) -> None:
         """Take a command of network management."""
@@ -302,7 +337,7 @@ class _Node:
             self._amplifier.handle("Stop", {"ramp": ramp}, now)
         self._state = state
 
-    def _tell(self, event: Values, now: float) -> None:
+    def _send_event(self, event: Values, now: float) -> None:
         """Send an event, with an emergency message if a fault starts or ends."""
         is_answering = self._amplifier.is_answering
         if is_answering and self._state == _OPERATIONAL:
@@ -310,15 +345,21 @@ class _Node:
         fault = name_of(FAULTS, event["fault"])
         is_faulty = fault != "NONE"
         if (is_faulty or self._was_faulty) and is_answering and self._state != _STOPPED:
-            known = CANOPEN["emergencies"][fault]
-            state = event["state"] | event["fault"] << 4
-            head = (known["code"], known["error_register"], state, event["channel"])
-            self._put(cob_id("emergency", self._number), struct.pack("<HBBB3x", *head))
+            emergency = CANOPEN["emergencies"][fault]
+            state_and_fault = event["state"] | event["fault"] << 4
+            data = struct.pack(
+                "<HBBB3x",
+                emergency["code"],
+                emergency["error_register"],
+                state_and_fault,
+                event["channel"],
+            )
+            self._put(cob_id("emergency", self._number), data)
         self._was_faulty = is_faulty
 
     def _put(self, can_id: int, *data: bytes) -> None:
         """Send frames with an identifier."""
-        self._send(pack_frames(CanFrame(can_id, each) for each in data))
+        self._send(pack_frames([CanFrame(can_id, frame_data) for frame_data in data]))
 
 
 Listener = Callable[[CanFrame], None]
@@ -375,10 +416,10 @@ class CanBus:
 
 
 class BusNodes:
-    """Amplifiers on a bus, each at the node of its number, with faults of its own each way.
+    """Amplifiers on a bus, each at the node of its number, with its own faults in each direction.
 
-    A damaged frame fails its CRC and is dropped. All take a frame at one time, however long a
-    simulation needs.
+    A damaged frame fails its CRC and is dropped. All amplifiers receive a frame at the same time,
+    regardless of the time that the simulation needs.
     """
 
     def __init__(self, bus: CanBus, devices: Sequence[AmplifierDevice]) -> None:
@@ -437,8 +478,9 @@ class SlcanAdapter(FarEnd):
     def __init__(self, bus: CanBus, send: SendBytes) -> None:
         self._bus = bus
         self._send = send
-        self._rest = b""
-        self._is_open = self._may_send = False
+        self._unfinished = b""
+        self._is_open = False
+        self._may_send = False
         bus.join(self._hear)
 
     def close(self) -> None:
@@ -447,17 +489,18 @@ class SlcanAdapter(FarEnd):
 
     def receive(self, data: bytes, now: float) -> None:
         """Process text from the host."""
-        *lines, self._rest = (self._rest + data).split(_CR)
+        *lines, self._unfinished = (self._unfinished + data).split(_CR)
         for line in lines:
-            self._send(self._answer(line.strip(b"\n")))
-        if len(self._rest) > _MAX_LENGTH:
-            self._rest = b""
+            self._send(self._reply(line.strip(b"\n")))
+        if len(self._unfinished) > _MAX_LENGTH:
+            self._unfinished = b""
             self._send(_BELL)
 
-    def _answer(self, line: bytes) -> bytes:
+    def _reply(self, line: bytes) -> bytes:
         match line:
             case b"O" | b"L" if not self._is_open:
-                self._is_open, self._may_send = True, line == b"O"
+                self._is_open = True
+                self._may_send = line == b"O"
                 return _CR
             case b"C":  # also when closed: hosts begin with it
                 self._is_open = False
@@ -471,7 +514,8 @@ class SlcanAdapter(FarEnd):
         if self._is_open and self._may_send:
             if _REMOTE.fullmatch(line) or _EXTENDED.fullmatch(line):
                 return (b"z" if line[:1] == b"r" else b"Z") + _CR  # no receiver for these
-            if frame := SLCAN.decode(line):
+            frame = SLCAN.decode(line)
+            if frame:
                 self._bus.send(frame, sender=self._hear)
                 return b"z" + _CR
         if not self._is_open and _SETTING.fullmatch(line):
@@ -493,8 +537,9 @@ class SocketcandClient(FarEnd):
     def __init__(self, bus: CanBus, send: SendBytes) -> None:
         self._bus = bus
         self._send = send
-        self._rest = b""
-        self._is_open = self._is_raw = False
+        self._unfinished = b""
+        self._is_open = False
+        self._is_raw = False
         send(b"< hi >")
 
     def close(self) -> None:
@@ -503,8 +548,8 @@ class SocketcandClient(FarEnd):
 
     def receive(self, data: bytes, now: float) -> None:
         """Process complete elements; text between them is skipped."""
-        *elements, rest = (self._rest + data).split(b">")
-        self._rest = rest if len(rest) <= _MAX_ELEMENT else b""
+        *elements, unfinished = (self._unfinished + data).split(b">")
+        self._unfinished = unfinished if len(unfinished) <= _MAX_ELEMENT else b""
         for element in elements:
             _, bracket, content = element.partition(b"<")
             if bracket:
@@ -525,7 +570,8 @@ class SocketcandClient(FarEnd):
             case b"echo":
                 self._send(b"< echo >")
             case _ if element.startswith(b"send "):
-                if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
+                frame = SOCKETCAND.decode_sent(b"<" + element)
+                if frame:  # otherwise socketcand does not reply, either
                     self._bus.send(frame, sender=self._hear)
             case _:
                 self._send(b"< error unknown command >")

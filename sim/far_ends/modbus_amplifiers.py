@@ -7,6 +7,7 @@ result, words). Not modelled: parity and collisions on a serial line.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from drivers.protocol.definition import BROADCAST, NAK, Message
 from drivers.wires.modbus_frames import (
@@ -63,9 +64,9 @@ class ModbusAmplifiers(FarEnd):
 
     def of_connection(self, send: SendBytes) -> "ModbusAmplifiers":
         """Return the same units for another connection; send: see above."""
-        other = ModbusAmplifiers({}, send, is_rtu=self._is_rtu)
-        other._units = self._units
-        return other
+        connection = ModbusAmplifiers({}, send, is_rtu=self._is_rtu)
+        connection._units = self._units
+        return connection
 
     @property
     def next_event(self) -> float:
@@ -87,81 +88,103 @@ class ModbusAmplifiers(FarEnd):
                     pdu = unit.reply(request, now, is_for_all=is_for_all)
                     if not is_for_all:
                         self._send(framed(number, pdu, request.transaction, is_rtu=self._is_rtu))
-                    if unit.is_moving:  # to the address that it has taken
+                    if unit.is_moving:
                         unit.is_moving = False
                         self._units[unit.address] = self._units.pop(number)
+
+
+@dataclass(frozen=True, slots=True)
+class _Reply:
+    """The reply to a message: tag of the request, result (0: done), words."""
+
+    tag: int
+    result: int
+    words: Sequence[int]
+
+    @property
+    def area(self) -> tuple[int, ...]:
+        """The registers of the reply area, with zeros behind the reply."""
+        registers = (self.tag, self.result, *self.words)
+        return registers + (0,) * (AREA - len(registers))
+
+
+_NO_REPLY = _Reply(0, 0, ())
 
 
 class _Unit:
     """The registers of an amplifier.
 
-    address: taken by SetAddress, once is_moving: after its reply was read.
+    address: set by SetAddress; is_moving: its reply has been read, so that the unit moves there.
     """
 
     def __init__(self, amplifier: AmplifierPort) -> None:
         self.address = 0
         self.is_moving = False
         self.amplifier = amplifier
-        self._replies: dict[int, tuple[int, int, Sequence[int]]] = {}  # tag, result, words
+        self._replies: dict[int, _Reply] = {}  # by number of the message
 
     def reply(self, adu: Adu, now: float, *, is_for_all: bool) -> bytes:
         """Return the PDU of the response to a request, an exception where Modbus defines one.
 
-        is_for_all: whether it is a write that is for all units; the reply area stays as it is.
+        is_for_all: whether it is a write to all units, which does not change the reply area.
         """
-        function, request = adu.pdu[0], parse_request(adu)
+        function = adu.pdu[0]
+        request = parse_request(adu)
         if request is None:
             is_known = function in (*READS, WRITE)
             return exception_to(function, _ILLEGAL_VALUE if is_known else _ILLEGAL_FUNCTION)
         if function in READS:
-            shown = self._read(request, now)
-            return (
-                response_pdu(request, shown) if shown else exception_to(function, _ILLEGAL_ADDRESS)
-            )
+            registers = self._read(request, now)
+            if not registers:
+                return exception_to(function, _ILLEGAL_ADDRESS)
+            return response_pdu(request, registers)
         message = message_written(request)
         if message is None:
             return exception_to(function, _ILLEGAL_ADDRESS)
         tag, *words = request.registers
-        is_made_by_reads = message.name in PRESENT and not words
-        done = (
-            (0, ())
-            if is_made_by_reads
-            else self._execute(message, words, now, is_for_all=is_for_all)
-        )
-        if is_for_all:
-            self.is_moving = message.name == "SetAddress" and done[0] == 0
+        if message.name in PRESENT and not words:
+            reply = _Reply(tag, 0, ())  # reads carry it out
         else:
-            self._replies[message.number] = tag, *done
+            reply = self._execute(tag, message, words, now, is_for_all=is_for_all)
+        if is_for_all:
+            self.is_moving = message.name == "SetAddress" and reply.result == 0
+        else:
+            self._replies[message.number] = reply
         return response_pdu(request)
 
     def _execute(
-        self, message: Message, words: Sequence[int], now: float, is_for_all: bool
-    ) -> tuple[int, Sequence[int]]:
-        """Return the result and the words of the reply to a message."""
+        self, tag: int, message: Message, words: Sequence[int], now: float, *, is_for_all: bool
+    ) -> _Reply:
+        """Carry out a message, and return its reply."""
         kind, reply = carry_out(self.amplifier, message.number, words, now, is_for_all=is_for_all)
         if kind == NAK:
             _, code, channel = reply or (0, 0, 0)
-            return code << 8 | channel, ()
+            return _Reply(tag, code << 8 | channel, ())
         if message.name == "SetAddress":
             self.address = words[0]
-        return 0, reply
+        return _Reply(tag, 0, reply)
 
     def _read(self, request: Pdu, now: float) -> Sequence[int]:
         """Return the registers that a request reads; none if any register cannot be read."""
-        address, count = request.address, request.count
-        if (message := message_shown(request)) is not None:
-            first = message.number * BOX + REPLY_OFFSET
-            tag, result, words = self._replies.get(message.number, (0, 0, ()))
-            if message.name in PRESENT:
-                if result:  # a rejection is read once
-                    self._replies[message.number] = tag, 0, ()
-                else:
-                    result, words = self._execute(message, (), now, is_for_all=False)
-            elif message.name == "SetAddress":
-                self.is_moving = self.address > 0 and result == 0
-            row = (tag, result, *words)
-            area = row + (0,) * (AREA - len(row))  # zeros behind a reply
+        message = message_shown(request)
+        if message is None:
+            first = IDENTITY_REGISTER
+            area = tuple(pack_identity(self.amplifier.identity))
         else:
-            first, area = IDENTITY_REGISTER, tuple(pack_identity(self.amplifier.identity))
-        is_within = first <= address <= address + count <= first + len(area)
-        return area[address - first :][:count] if is_within else ()
+            first = message.number * BOX + REPLY_OFFSET
+            area = self._present_reply(message, now).area
+        begin = request.address - first
+        end = begin + request.count
+        is_within = 0 <= begin <= end <= len(area)
+        return area[begin:end] if is_within else ()
+
+    def _present_reply(self, message: Message, now: float) -> _Reply:
+        """Return the reply that a read of a message shows now."""
+        reply = self._replies.get(message.number, _NO_REPLY)
+        if message.name in PRESENT:
+            if not reply.result:
+                return self._execute(reply.tag, message, (), now, is_for_all=False)
+            self._replies[message.number] = _Reply(reply.tag, 0, ())  # a rejection is read once
+        elif message.name == "SetAddress":
+            self.is_moving = self.address > 0 and reply.result == 0
+        return reply

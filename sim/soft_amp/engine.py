@@ -15,7 +15,7 @@ from model.errors import InputError
 from sim.soft_amp.settings import Law, SoftAmplifierLine, SoftAmplifierSettings
 
 ENGINE = "sound-engine.so"
-"""File of the library in a platform wheel. It is not named like a module, which it would hide."""
+"""File of the library in a platform wheel; a module name would hide this module."""
 
 _HERE = Path(__file__).parent
 _FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout
@@ -49,9 +49,9 @@ def library() -> ctypes.CDLL:
 
 def callback_address(name: str) -> int:
     """Return the address of a callback in the library."""
-    found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
-    assert found is not None  # noqa: S101  of a function
-    return found
+    address = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
+    assert address is not None  # noqa: S101  of a function
+    return address
 
 
 def compile_engine(path: Path) -> None:
@@ -62,18 +62,24 @@ def compile_engine(path: Path) -> None:
 
 def _recipe() -> tuple[list[Path], list[Path], list[str]]:
     """Sources, headers and flags of the compiler; raises InputError."""
-    folder = next((each for each in _FOLDERS if (each / "ports" / "sound").is_dir()), None)
-    if folder is None:
-        raise InputError(
-            f"soft-amp: its C sources are missing in {_FOLDERS[0]}; reinstall era-haptics"
-        )
-    sources = [
-        *(folder / "core" / f"{name}.c" for name in _CORE),
-        *(folder / "wire" / f"{name}.c" for name in _WIRE),
-        *(folder / "ports" / "sound").glob("*.c"),
-    ]
-    headers = [path for part in _PARTS for path in (folder / part).glob("*.h")]
-    return sources, headers, [*_FLAGS, *(f"-I{folder / part}" for part in _PARTS)]
+    folder = _source_folder()
+    sources = [folder / "core" / f"{name}.c" for name in _CORE]
+    sources += [folder / "wire" / f"{name}.c" for name in _WIRE]
+    sources += (folder / "ports" / "sound").glob("*.c")
+    headers: list[Path] = []
+    flags = list(_FLAGS)
+    for part in _PARTS:
+        headers += (folder / part).glob("*.h")
+        flags.append(f"-I{folder / part}")
+    return sources, headers, flags
+
+
+def _source_folder() -> Path:
+    """The folder of the C sources; raises InputError."""
+    for folder in _FOLDERS:
+        if (folder / "ports" / "sound").is_dir():
+            return folder
+    raise InputError(f"soft-amp: its C sources are missing in {_FOLDERS[0]}; reinstall era-haptics")
 
 
 class Counters(ctypes.Structure):
@@ -111,12 +117,12 @@ class _LinesSettings(ctypes.Structure):
 
 
 def start_engine(
-    settings: SoftAmplifierSettings, place: SoftAmplifierLine, *, rate: int, counters: Counters
+    settings: SoftAmplifierSettings, line: SoftAmplifierLine, *, rate: int, counters: Counters
 ) -> None:
     """Start the amplifiers at a sample rate [Hz], and serve their line; raises LinkError.
 
-    Requests of hosts take effect when the callback renders a block. There is one engine in a
-    process, and it has no end.
+    Requests of hosts take effect when the callback renders a block. A process has one engine, which
+    runs until the process ends.
     """
     sound = _SoundSettings(
         rate,
@@ -127,7 +133,7 @@ def start_engine(
         settings.max_gaps,
         settings.serial_number.encode(),
     )
-    lines = _LinesSettings(place.terminal, place.listening)
+    lines = _LinesSettings(line.terminal, line.listening)
     problem = library().sound_start(
         ctypes.byref(sound), ctypes.byref(lines), ctypes.byref(counters)
     )

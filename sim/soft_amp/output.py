@@ -1,4 +1,4 @@
-"""Sound devices of PortAudio: found by name or number, and driven by a callback in C."""
+"""Sound devices of PortAudio: their selection by name or number, and streams with a C callback."""
 
 import atexit
 import os
@@ -14,13 +14,15 @@ from sim.soft_amp.engine import callback_address
 from sim.soft_amp.settings import SoftAmplifierSettings, check_rate
 
 JACK = "JACK"
-"""How the name of PortAudio's JACK host API begins."""
+"""Begin of the name of PortAudio's JACK host API."""
 
-_WITH_PRIORITY, _WITHOUT = 128, 256  # frames of a block, each below the 10 ms of a reply
+# Frames of a block at real-time and at ordinary priority, below the 10 ms of a reply.
+_REALTIME_BLOCK = 128
+_ORDINARY_BLOCK = 256
 
 
 def sounddevice() -> ModuleType:
-    """Return the library; raises InputError if it or PortAudio is missing."""
+    """Return python-sounddevice; raises InputError if it or PortAudio is missing."""
     try:
         import sounddevice as library
     except ModuleNotFoundError:
@@ -43,23 +45,23 @@ def portaudio_device(device: str, *, outputs: int, inputs: int = 0) -> Any:
     library = sounddevice()
     number: int | str = int(device) if device.isdecimal() else device
     try:
-        found = library.query_devices(number, None if inputs else "output")
+        description = library.query_devices(number, None if inputs else "output")
     except (ValueError, library.PortAudioError) as problem:
         raise _no_device(device, str(problem).splitlines()[0]) from None
-    for what, count in (("output", outputs), ("input", inputs)):
-        offered = found[f"max_{what}_channels"]
-        if offered < count:
+    for direction, count in (("output", outputs), ("input", inputs)):
+        available = description[f"max_{direction}_channels"]
+        if available < count:
             raise InputError(
-                f"--device {found['name']} must have {count} {what}s, got {offered}; list devices "
-                "with era soft-amp --list"
+                f"--device {description['name']} must have {count} {direction}s, got {available}; "
+                "list devices with era soft-amp --list"
             )
-    return found
+    return description
 
 
 def _no_device(device: str, reason: str) -> Exception:
     """The error for a device that PortAudio does not find, or finds more than once."""
     library = sounddevice()
-    names = [known["name"] for known in library.query_devices()]
+    names = [description["name"] for description in library.query_devices()]
     if not names:
         return LinkError(
             "PortAudio: no device found; connect a sound card, or start the sound server as this "
@@ -76,17 +78,25 @@ def _no_device(device: str, reason: str) -> Exception:
 
 
 def portaudio_stream(
-    number: int, callback: int, given: int, *, outputs: int, inputs: int = 0, **options: object
+    number: int, callback: int, user_data: int, *, outputs: int, inputs: int = 0, **options: object
 ) -> Any:
-    """Start a stream of a device by number, with a callback of C that is given an address.
+    """Start a stream of a device by number, with a C callback that gets the address of its data.
 
     Raises PortAudioError.
     """
     library = sounddevice()
     ffi = library._ffi
-    kind = "duplex" if outputs and inputs else "input" if inputs else "output"
-    channels = {"duplex": (inputs, outputs), "input": inputs, "output": outputs}[kind]
-    # Only this class takes a callback of C. It is made for authors of libraries.
+    channels: int | tuple[int, int]
+    if outputs and inputs:
+        kind = "duplex"
+        channels = (inputs, outputs)
+    elif inputs:
+        kind = "input"
+        channels = inputs
+    else:
+        kind = "output"
+        channels = outputs
+    # Only this class takes a C callback. It is made for authors of libraries.
     stream = library._StreamBase(
         kind=kind,
         device=number,
@@ -95,7 +105,7 @@ def portaudio_stream(
         callback=ffi.cast("PaStreamCallback *", callback),
         clip_off=True,
         dither_off=True,
-        userdata=ffi.cast("void *", given),
+        userdata=ffi.cast("void *", user_data),
         **options,
     )
     try:
@@ -127,17 +137,19 @@ def is_of_jack(device: Any) -> bool:
 
 def may_be_realtime() -> bool:
     """Whether this process may raise the priority of its threads."""
-    limit, _ = (
-        resource.getrlimit(resource.RLIMIT_RTPRIO) if hasattr(resource, "RLIMIT_RTPRIO") else (0, 0)
-    )
-    return limit != 0 or os.geteuid() == 0
+    if os.geteuid() == 0:
+        return True
+    if not hasattr(resource, "RLIMIT_RTPRIO"):
+        return False
+    limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    return limit != 0
 
 
 def default_block(device: Any) -> int:
     """Frames of a block of a device unless stated; 0: the period of the JACK server."""
     if is_of_jack(device):
         return 0
-    return _WITH_PRIORITY if may_be_realtime() else _WITHOUT
+    return _REALTIME_BLOCK if may_be_realtime() else _ORDINARY_BLOCK
 
 
 _REFUSED = {-9997: "--rate", -9998: "--channels"}
@@ -168,7 +180,8 @@ class PortAudioOutput:
         self._stream: Any = None
 
     def _refused(self, problem: Exception) -> Exception:
-        text, number = problem.args[0], problem.args[-1]
+        text = problem.args[0]
+        number = problem.args[-1]
         if number in _REFUSED:
             return InputError(
                 f"{_REFUSED[number]} must be supported by {self.name}, got {self.rate} Hz, "
@@ -241,7 +254,7 @@ _MISSING = {
 
 
 def listed_devices() -> tuple[list[str], dict[str, Any]]:
-    """All devices as lines and for programs, and why devices or JACK are missing."""
+    """All devices as lines and for programs, and the reasons if devices or JACK are missing."""
     devices = list(portaudio_devices())
     missing = []
     if not devices:

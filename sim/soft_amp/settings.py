@@ -36,8 +36,8 @@ class SoftAmplifierSettings:
     """A software amplifier.
 
     device: name or number of a device of PortAudio; rate [Hz] and block [frames]: None for the
-    defaults of the device; limit: largest sample, 0..1; max_gaps: gaps in the sound within a
-    second, more are a fault. Raises InputError.
+    defaults of the device; limit: largest sample, 0..1; max_gaps: gaps in the sound per second
+    above which a fault is latched. Raises InputError.
     """
 
     device: str
@@ -58,10 +58,11 @@ class SoftAmplifierSettings:
                 f"--channels above {CHANNELS_OF_AMPLIFIER} must be even, since they are two "
                 f"amplifiers of half as many, got {self.channels}"
             )
-        least = math.sqrt(0.5) if self.law == Law.SQUARE else 0.0
-        if not least < self.limit <= 1:
+        min_limit = math.sqrt(0.5) if self.law == Law.SQUARE else 0.0
+        if not min_limit < self.limit <= 1:
             raise InputError(
-                f"--limit must be above {least:.3g} and at most 1 with this law, got {self.limit:g}"
+                f"--limit must be above {min_limit:.3g} and at most 1 with this law, got "
+                f"{self.limit:g}"
             )
         if self.rate is not None:
             check_rate(self.rate, what="--rate")
@@ -97,13 +98,15 @@ class SoftAmplifierLine:
         """The URL of each amplifier."""
         if protocol is Protocol.MODBUS:
             return [f"{self.url}/{unit}" for unit in range(1, amplifiers + 1)]
-        others = range(2, amplifiers + 1)
-        return [self.url, *(f"{self.url}?address={address}" for address in others)]
+        urls = [self.url]
+        for address in range(2, amplifiers + 1):
+            urls.append(f"{self.url}?address={address}")
+        return urls
 
 
 @contextmanager
 def terminal_place(link: Path | None) -> Iterator[SoftAmplifierLine]:
-    """A pseudo-terminal, and a symbolic link to it while this lasts; raises InputError."""
+    """A pseudo-terminal, and a symbolic link to it in this context; raises InputError."""
     import tty  # not on Windows
 
     from sim.transport.far_end import linked  # loads asyncio, which the help does without

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from sim.soft_amp.settings import SoftAmplifierLine
 
 
-def port_option(served: str) -> Any:
-    """Return the option for a loopback port; served: the protocol on this port."""
+def port_option(protocol: str) -> Any:
+    """Return the option for a loopback port with this protocol."""
     return typer.Option(
-        metavar="PORT", help=f"Serve {served} on this loopback port; 0: any.", min=0, max=65535
+        metavar="PORT", help=f"Serve {protocol} on this loopback port; 0: any.", min=0, max=65535
     )
 
 
@@ -122,11 +122,11 @@ def soft_amp(
         limit=limit,
         max_gaps=max_gaps,
     )
-    with _place(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as place:
-        player = SoftAmplifierPlayer(settings, place, report=_report)
+    with _open_line(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as line:
+        player = SoftAmplifierPlayer(settings, line, report=_report)
         try:
             player.start()
-            for url in place.urls(settings.amplifiers, protocol=protocol):
+            for url in line.urls(settings.amplifiers, protocol=protocol):
                 print(url, flush=True)
             with suppress(KeyboardInterrupt):
                 player.watch(until=sys.stdin.fileno() if until_eof else None)
@@ -139,20 +139,24 @@ def _report(line: str) -> None:
     print(f"soft-amp: {line}", file=sys.stderr, flush=True)
 
 
-def _serial_number(given: str | None, *, device: str) -> str:
-    if given is None:
+def _serial_number(option: str | None, *, device: str) -> str:
+    """The serial number in an option, by default from the host's name and the device."""
+    if option is None:
         import socket
         import zlib
 
-        return f"SOFT-{zlib.crc32(f'{socket.gethostname()} {device}'.encode()):08X}"
-    if not 1 <= len(given.encode()) <= 30:
-        raise InputError(f"--serial-number must have 1 to 30 bytes, got {len(given.encode())}")
-    return given
+        origin = f"{socket.gethostname()} {device}"
+        return f"SOFT-{zlib.crc32(origin.encode()):08X}"
+    length = len(option.encode())
+    if not 1 <= length <= 30:
+        raise InputError(f"--serial-number must have 1 to 30 bytes, got {length}")
+    return option
 
 
-def _place(
+def _open_line(
     *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
 ) -> "AbstractContextManager[SoftAmplifierLine]":
+    """Open the line of the option that is set, by default a pseudo-terminal; raises InputError."""
     from sim.soft_amp.settings import tcp_place, terminal_place
 
     ports = {
@@ -160,12 +164,13 @@ def _place(
         "--tcp": tcp,
         "--modbus-tcp": modbus_tcp,
     }
-    given = [name for name, port in ports.items() if port is not None]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} exclude each other; give one")
-    if given in ([], ["--serial"]):
+    options = [option for option, port in ports.items() if port is not None]
+    if len(options) > 1:
+        raise InputError(f"{' and '.join(options)} exclude each other; give one")
+    if options in ([], ["--serial"]):
         return terminal_place(link)
+    (option,) = options
     if link is not None:
-        raise InputError(f"--link is of a pseudo-terminal; omit it, or {given[0]}")
+        raise InputError(f"--link is of a pseudo-terminal; omit it, or {option}")
     protocol = Protocol.SERIAL if modbus_tcp is None else Protocol.MODBUS
-    return tcp_place(ports[given[0]] or 0, protocol=protocol)
+    return tcp_place(ports[option] or 0, protocol=protocol)

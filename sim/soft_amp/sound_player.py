@@ -35,8 +35,8 @@ def _has_ended(descriptor: int | None, *, timeout: float) -> bool:
 def _raise_priority() -> None:
     """Give all threads real-time priority if that is allowed (Linux).
 
-    A process that is killed is heard until its last thread has ended, which takes a busy machine
-    half a second at ordinary priority.
+    A killed process stays audible until its last thread has ended, which takes half a second on a
+    busy machine at ordinary priority.
     """
     priority = os.sched_param(_PRIORITY)
     for folder in Path("/proc/self/task").iterdir():
@@ -54,7 +54,7 @@ class SoftAmplifierPlayer:
     def __init__(
         self,
         settings: SoftAmplifierSettings,
-        place: SoftAmplifierLine,
+        line: SoftAmplifierLine,
         *,
         report: Callable[[str], None],
     ) -> None:
@@ -63,7 +63,7 @@ class SoftAmplifierPlayer:
         self._counters = Counters()
         self._output = PortAudioOutput(settings)
         self._manager = ServiceManager()
-        start_engine(settings, place, rate=self._output.rate, counters=self._counters)
+        start_engine(settings, line, rate=self._output.rate, counters=self._counters)
 
     def start(self) -> None:
         """Play, from silence; returns with the first block. Raises LinkError."""
@@ -85,15 +85,16 @@ class SoftAmplifierPlayer:
         self._manager.ready(opened)
 
     def watch(self, *, until: int | None) -> None:
-        """Play until a descriptor ends, or KeyboardInterrupt; None: without an end.
+        """Play until a descriptor is at its end (None: never), or until KeyboardInterrupt.
 
-        SIGTERM is taken as KeyboardInterrupt, and Ctrl-Z ignored: it would stop the sound thread.
-        Raises LinkError when the device is gone.
+        SIGTERM raises KeyboardInterrupt, and Ctrl-Z is ignored: it would stop the sound thread.
+        Raises LinkError when the device is lost.
         """
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         signal.signal(signal.SIGTSTP, signal.SIG_IGN)
         blocks = 0
-        reported_at, reported = time.monotonic(), (0, 0)
+        reported_at = time.monotonic()
+        reported_losses = (0, 0)
         while True:
             if _has_ended(until, timeout=_POLL):
                 return
@@ -104,8 +105,9 @@ class SoftAmplifierPlayer:
                 blocks = self._counters.blocks
                 self._manager.alive(now)
             losses = (self._counters.gaps, self._counters.xruns)
-            if losses != reported and now - reported_at > _REPORT:
-                reported_at, reported = now, losses
+            if losses != reported_losses and now - reported_at > _REPORT:
+                reported_at = now
+                reported_losses = losses
                 self._report(self.underruns())
 
     def _lose(self) -> None:

@@ -33,9 +33,9 @@ TERMINAL_SCHEMES = ("serial", "modbus+rtu", "can+slcan")
 
 
 def links_by_amplifier(options: Sequence[str], *, amplifiers: Sequence[str]) -> dict[str, Path]:
-    """The links of amplifiers by name; options: texts as `PATH` or `NAME=PATH`. Raises InputError.
+    """The links of amplifiers by name; options: `NAME=PATH`, or `PATH` for the first amplifier.
 
-    `PATH` alone is the path of the first amplifier.
+    Raises InputError.
     """
     links: dict[str, Path] = {}
     for text in options:
@@ -76,34 +76,36 @@ def linked_urls(urls: Mapping[str, str], links: Mapping[str, Path]) -> Iterator[
 
 
 def _moved(url: str, paths: Mapping[str, str]) -> str:
-    before = urlsplit(url).path
-    return url.replace(before, paths[before], 1) if before in paths else url
+    """The URL with the link of its pseudo-terminal, if it has one."""
+    terminal = urlsplit(url).path
+    if terminal not in paths:
+        return url
+    return url.replace(terminal, paths[terminal], 1)
 
 
 @contextmanager
 def linked(link: Path, *, to: str) -> Iterator[str]:
-    """A symbolic link to a path while this lasts; yields its absolute path. Raises InputError."""
+    """A symbolic link to a path in this context; yields its absolute path. Raises InputError."""
     with _lock(link):
         if not link.is_symlink() and link.exists():
             raise InputError(f"--link {link}: exists and is no symbolic link; choose another path")
-        made = link.with_name(f".{link.name}.{os.getpid()}")
+        temporary = link.with_name(f".{link.name}.{os.getpid()}")
         try:
-            made.symlink_to(to)
-            made.replace(link)
+            temporary.symlink_to(to)
+            temporary.replace(link)
         except OSError as problem:
             raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
         try:
             yield str(link.absolute())
         finally:
-            if (
-                link.is_symlink() and str(link.readlink()) == to
-            ):  # not replaced by another program meanwhile
+            # Another program may have replaced it meanwhile.
+            if link.is_symlink() and str(link.readlink()) == to:
                 link.unlink()
 
 
 @contextmanager
 def _lock(link: Path) -> Iterator[None]:
-    """Keep others from a link; a lock ends with its process, even a killed one."""
+    """Lock a link against other programs; the lock ends with its process, even if killed."""
     path = link.with_name(f".{link.name}.lock")
     try:
         file = path.open("wb")
@@ -131,7 +133,8 @@ class PseudoTerminal:
 
     def __init__(self, on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> None:
         self._on_data = on_data
-        self._master = self._slave = -1
+        self._master = -1
+        self._slave = -1
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.plug_in()
         if unpluggable:
@@ -174,11 +177,12 @@ class PseudoTerminal:
             return
         asyncio.get_running_loop().remove_reader(self._master)
         if self._folder is not None:
-            # First: once it is closed its number may be another's, whom the host would find here.
+            # Before closing: another program can then get the same number, and its bytes.
             Path(self.port).unlink(missing_ok=True)
         os.close(self._master)
         os.close(self._slave)
-        self._master = self._slave = -1
+        self._master = -1
+        self._slave = -1
 
     def plug(self, is_plugged: bool) -> None:
         """Unplug the line, or plug it in and read again."""
@@ -264,8 +268,9 @@ def carry_out(
 ) -> tuple[int, Sequence[int]]:
     """Carry out a request, by type and words, at a time [s]; returns type and words of its reply.
 
-    A refusal is a Nak; no words: it has no reply, as an earlier part of a set. is_for_all: whether
-    it is for all amplifiers, which do not reply; address_max: of the wire.
+    A refusal is a Nak. No words: the request has no reply, like a part of a set other than the
+    last. is_for_all: whether the request is for all amplifiers, which do not reply; address_max: of
+    the wire.
     """
     if kind == HELLO:
         return HELLO, REQUESTS["Hello"].reply.pack(amplifier.identity)
@@ -285,7 +290,7 @@ def carry_out(
 
 SendBytes = Callable[[bytes], None]
 MakeEnd = Callable[[SendBytes], FarEnd]
-"""Makes a far end, of the function that it sends by; no bytes: the connection ends."""
+"""Makes a far end from its function to send bytes; no bytes end the connection."""
 
 
 class TimedFarEnd:
@@ -372,7 +377,7 @@ class TcpEnd:
     """A TCP port on the loopback interface, 0 for any, as an asynchronous context.
 
     make_end: of each connection; device, faults and delays: see `TerminalEnd`. An unplugged port
-    closes its connections, unlike a cable. Entering it raises LinkError where the port is in use.
+    closes its connections, unlike a cable. Entering it raises LinkError if the port is in use.
     """
 
     def __init__(

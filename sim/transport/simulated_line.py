@@ -17,7 +17,8 @@ from registry import threads
 from sim.faults import Faults, Toward
 
 _FTDI_PACKET = 62  # bytes, in addition to two status bytes
-_SIGMAS, _STALLS = 4.0, 5.0  # limits of the log-normal part and of a stall
+_MAX_SIGMAS = 4.0  # limit of the log-normal part
+_MAX_STALL = 5.0  # limit of a stall, in mean stalls
 _ORDER = 1e-9  # s; between arrivals, because simultaneous timers run in arbitrary order
 _FRAME_ERROR = 50e-6  # of a USB host's crystal relative to its machine's clock; up to 500e-6
 
@@ -26,8 +27,8 @@ _FRAME_ERROR = 50e-6  # of a USB host's crystal relative to its machine's clock;
 class Latency:
     """Time that programs and drivers take [s]: `least`, a log-normal part, and seldom a stall.
 
-    median, sigma: of the log-normal part; stalls: share of those with an exponential stall, which
-    is of this mean [s], and never longer than five times that.
+    median, sigma: of the log-normal part; stalls: share with an exponential stall; stall: its mean
+    [s], of which it takes five times at most.
     """
 
     least: float = 0.0
@@ -38,17 +39,19 @@ class Latency:
 
     def draw(self, rng: random.Random) -> float:
         """Draw one [s]."""
-        log = self.sigma * max(min(rng.gauss(0.0, 1.0), _SIGMAS), -_SIGMAS)
-        stalled = 0.0
+        deviation = max(min(rng.gauss(0.0, 1.0), _MAX_SIGMAS), -_MAX_SIGMAS)
+        typical = self.least + self.median * math.exp(self.sigma * deviation)
         if rng.random() < self.stalls:
-            stalled = min(rng.expovariate(1 / self.stall), _STALLS * self.stall)
-        return self.least + self.median * math.exp(log) + stalled
+            return typical + min(rng.expovariate(1 / self.stall), _MAX_STALL * self.stall)
+        return typical
 
     @property
     def max_delay(self) -> float:
         """The longest one [s]."""
-        typical = self.least + self.median * math.exp(_SIGMAS * self.sigma)
-        return typical + (_STALLS * self.stall if self.stalls else 0.0)
+        without_stall = self.least + self.median * math.exp(_MAX_SIGMAS * self.sigma)
+        if not self.stalls:
+            return without_stall
+        return without_stall + _MAX_STALL * self.stall
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,9 @@ class LineDelays:
         self._rng = rng
         self._frame = kind.frame * (1 + rng.uniform(-_FRAME_ERROR, _FRAME_ERROR))
         self._first_frame = rng.uniform(0.0, kind.frame)
-        self._left = self._arrived = -math.inf
+        # Times [s] of the last bytes in each direction.
+        self._left = -math.inf
+        self._arrived = -math.inf
         self._packet_sent = rng.uniform(0.0, kind.latency_timer)  # of an FTDI chip, to the host
         self._held = 0  # bytes in that chip
 
@@ -111,13 +116,15 @@ class LineDelays:
     def _packet_end(self, time: float, size: int) -> float:
         """Return when an FTDI chip lets the last byte go [s].
 
-        It sends packets that are full, and what it has, if only its status, once the timer has run
-        since the last packet (AN232B-04, *Small amounts of data and end of buffer conditions*).
+        It sends full packets. When the timer has run since the last packet it sends the bytes that
+        it holds, or its status alone (AN232B-04, *Small amounts of data and end of buffer
+        conditions*).
         """
         timer = self._kind.latency_timer
         if not timer:
             return time
-        if (expired := math.floor((time - self._packet_sent) / timer)) > 0:
+        expired = math.floor((time - self._packet_sent) / timer)
+        if expired > 0:
             self._packet_sent += expired * timer
             self._held = 0
         packets, self._held = divmod(self._held + size, _FTDI_PACKET)
@@ -126,11 +133,11 @@ class LineDelays:
         return self._packet_sent + timer if self._held else time
 
 
-# Of a machine with three processes for each processor, measured on a pseudo-terminal: half of the
-# wake-ups take less than 81 us, one in ten less than 42, one in a hundred more than a millisecond.
+# A machine with three processes per processor, measured on a pseudo-terminal: the median wake-up
+# takes 81 us, the 10th percentile is 42 us, and 1 % take more than a millisecond.
 _WRITING = Latency(least=8e-6, median=5e-6, sigma=0.8, stalls=0.005, stall=1e-3)
 _WAKING = Latency(least=20e-6, median=55e-6, sigma=0.6, stalls=0.02, stall=1e-3)
-# With the network stacks of both ends, and a task of the amplifier that waits for its turn.
+# Includes the network stacks of both ends, and the amplifier's task waiting for its processor.
 _SENDING = Latency(least=60e-6, median=50e-6, sigma=1.0, stalls=0.02, stall=2e-3)
 _RECEIVING = Latency(least=80e-6, median=90e-6, sigma=1.0, stalls=0.03, stall=2e-3)
 _HIGH_SPEED = LineKind(_WRITING, _WAKING, frame=125e-6, usb_byte=8 / 480e6)
@@ -205,9 +212,12 @@ class SimulatedLine:
             leaves = now
             if self._delays is not None and self._toward == "amplifier":
                 leaves = self._delays.leave(now, len(data))
-            size = max(int(_PIECE / self._byte_time), 1) if self._byte_time else max(len(data), 1)
-            for at in range(0, max(len(data), 1), size):  # no bytes: the end of a connection
-                piece = data[at : at + size]
+            length = max(len(data), 1)  # no bytes: the end of a connection
+            piece_length = length
+            if self._byte_time:
+                piece_length = max(int(_PIECE / self._byte_time), 1)
+            for start in range(0, length, piece_length):
+                piece = data[start : start + piece_length]
                 self._free_from = max(leaves, self._free_from) + len(piece) * self._byte_time
                 arrives = self._free_from
                 if self._delays is not None and self._toward == "host":

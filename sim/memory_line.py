@@ -76,7 +76,7 @@ class SimulationUrl:
 
 @asynccontextmanager
 async def _opened(url: SimulationUrl) -> AsyncIterator[tuple[SimulationContext, str]]:
-    """The simulation of a URL while this lasts, and the name of its amplifier.
+    """The running simulation of a URL, and the name of its amplifier.
 
     Raises CommandError, LinkError.
     """
@@ -99,10 +99,11 @@ def _shared(url: SimulationUrl) -> "_SharedRig":
         return _SharedRig(None)
     control = url.control and url.control.resolve()
     key = (url.rig.resolve(), control, url.seed)
-    found = _rigs.get(key)
-    if found is None:
-        found = _rigs[key] = _SharedRig(url.control)
-    return found
+    shared = _rigs.get(key)
+    if shared is None:
+        shared = _SharedRig(url.control)
+        _rigs[key] = shared
+    return shared
 
 
 class _SharedRig:
@@ -116,7 +117,7 @@ class _SharedRig:
         self._running = contextlib.AsyncExitStack()
 
     async def acquire(self, rig: Rig, seed: int | None) -> SimulationContext:
-        """Use it, made by the first user; raises what making it raises."""
+        """Use the simulation, which the first user starts; raises InputError, LinkError."""
         async with self._lock:
             if self._context is None:
                 context = SimulationContext(await asyncio.to_thread(self._make, rig, seed))
@@ -130,7 +131,7 @@ class _SharedRig:
             return self._context
 
     async def release(self) -> None:
-        """End the use by one; the last one ends the simulation."""
+        """End the use by one user; the last user ends the simulation."""
         async with self._lock:
             self._users -= 1
             if self._users == 0:
@@ -147,11 +148,11 @@ _rigs: WeakValueDictionary[object, _SharedRig] = WeakValueDictionary()
 
 
 class MemoryPort:
-    """The port of a host, with devices at the addresses of their numbers at the other end.
+    """The port of a host, with devices at their addresses at the other end.
 
-    It works in the running event loop. on_data: called with what they send; on_loss: called once
-    with the cause when the first device is unplugged; delays: see `TwoWayLine`. Raises LinkError
-    while it is.
+    It works in the running event loop. on_data: called with bytes of the devices; on_loss: called
+    once with the cause when the first device is unplugged; delays: see `TwoWayLine`. Raises
+    LinkError while the first device is unplugged.
     """
 
     is_blocked = False
@@ -166,10 +167,10 @@ class MemoryPort:
         self._first = devices[0]
         if not self._first.is_plugged:
             raise LinkError(f"amplifier {self._first.name} is unplugged")
-        self._on_data, self._on_loss = on_data, on_loss
-        self._end = SerialAmplifiers(
-            {each.address: each for each in devices}, lambda data: self._wire.outward.send(data)
-        )
+        self._on_data = on_data
+        self._on_loss = on_loss
+        amplifiers = {device.address: device for device in devices}
+        self._end = SerialAmplifiers(amplifiers, lambda data: self._wire.outward.send(data))
         self._wire = TwoWayLine(
             to_amplifier=self._end.receive,
             to_host=self._deliver,
@@ -177,7 +178,7 @@ class MemoryPort:
             delays=delays,
         )
         self.running = contextlib.AsyncExitStack()
-        """What runs for it, which ends when it is closed."""
+        """Contexts that end with the port."""
         self._is_open = True
         self._first.plug_listeners.append(self._plug)
 
@@ -191,7 +192,7 @@ class MemoryPort:
         """Do nothing: received bytes were already delivered."""
 
     def close(self) -> None:
-        """Close it; disarm before, or vibrations last until the watchdogs trip."""
+        """Close it; disarm before, or vibrations continue until the watchdogs trip."""
         if self._is_open:
             self._is_open = False
             self._first.plug_listeners.remove(self._plug)
@@ -199,7 +200,7 @@ class MemoryPort:
             self._wire.close()
 
     async def wait_closed(self) -> None:
-        """End what runs for it."""
+        """End the contexts of the port."""
         await self.running.aclose()
 
     def _deliver(self, data: bytes) -> None:
@@ -221,7 +222,8 @@ class SimulatedAddress(WireAddress):
 
     def __init__(self, url: str) -> None:
         self._url = SimulationUrl(url)
-        self.line, self.number = url, 1
+        self.line = url
+        self.number = 1
         self.settings = {"protocol": "serial"}
 
     def make_wire(self) -> SerialWire:

@@ -3,9 +3,9 @@
 Uses the time of the event loop: the wall clock, or a virtual clock stepped explicitly while I/O is
 served as usual.
 
-The project's firmware may be in place of the simulated amplifiers: a process with a serial line for
+The project's firmware can replace the simulated amplifiers, with a process and a serial line for
 each. `make firmware` builds it from the sources of a checkout; it is not part of the wheel. Its
-samples go nowhere, so the plate does not move.
+samples drive nothing, so the plate does not move.
 """
 
 import asyncio
@@ -36,6 +36,7 @@ FIRMWARE_FOLDER = Path(__file__).parents[1] / "out" / "firmware"
 """Where `make firmware` puts its programs."""
 
 _STARTUP_TIMEOUT = 10.0  # s
+STEP = 0.005  # s of virtual time; the largest delay of a timer
 
 
 def find_firmware() -> Path:
@@ -55,7 +56,7 @@ def find_firmware() -> Path:
 async def running_firmware(program: Path, name: str) -> AsyncIterator[str]:
     """Run the firmware for an amplifier, yield its URL. Raises LinkError.
 
-    It ends with this process, also if that is killed: its standard input is at its end then.
+    It ends with this process, even if this process is killed, because its standard input ends.
     """
     process = await asyncio.create_subprocess_exec(
         program,
@@ -80,11 +81,8 @@ async def running_firmware(program: Path, name: str) -> AsyncIterator[str]:
         await process.wait()
 
 
-STEP = 0.005  # s; the largest delay of a timer
-
-
 class SteppedLoop(asyncio.SelectorEventLoop):
-    """An event loop whose time begins at 0 s."""
+    """An event loop with virtual time, which begins at 0 s."""
 
     def __init__(self) -> None:
         self._now = 0.0
@@ -110,8 +108,8 @@ class Simulation:
 
     faults: with times from when the URLs are printed; fingers: initial positions [m];
     imperfections: differences between bench and rig; control: path of the control socket;
-    until_eof: end with standard input; firmware: in the place of the simulated amplifiers;
-    links: to their pseudo-terminals.
+    until_eof: end with standard input; firmware: program to run instead of simulated amplifiers;
+    links: to the pseudo-terminals.
     """
 
     rig: Rig
@@ -209,7 +207,7 @@ async def _open_devices(
 
 
 def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
-    """Read standard input until its end, which also comes when the parent dies."""
+    """Read standard input until its end, also reached when the parent process dies."""
     with contextlib.suppress(OSError):  # closed already
         while os.read(0, 4096):
             pass

@@ -12,6 +12,13 @@ from sim.amplifier.thermal_state import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults import Faults, FaultWindow
 
+_Edge: TypeAlias = Literal["begin", "half", "end"]
+_TEMPERATURES: dict[_Edge, float] = {
+    "begin": DERATE_ABOVE + 1,
+    "half": FAULT_ABOVE + 1,
+    "end": AMBIENT,
+}
+
 
 class AmplifierDevice:
     """An amplifier of a bench by name, in place of an `Amplifier`, with its faults.
@@ -31,7 +38,8 @@ class AmplifierDevice:
         self.faults = Faults() if faults is None else faults
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
-        self.identity, self.listeners = self._amplifier.identity, self._amplifier.listeners
+        self.identity = self._amplifier.identity
+        self.listeners = self._amplifier.listeners
         self.plug_listeners: list[Callable[[bool], None]] = []
         self.boot_listeners: list[Callable[[], None]] = []
         self._unplugged = 0  # active unplug faults
@@ -126,7 +134,7 @@ class AmplifierDevice:
             elif delay < math.inf:
                 self._timers.append(loop.call_later(delay, self._handle_edge, window, edge))
 
-    def _handle_edge(self, window: FaultWindow, edge: "_Edge") -> None:
+    def _handle_edge(self, window: FaultWindow, edge: _Edge) -> None:
         """Apply an edge (begin, half, end) of a fault window."""
         now = threads.now()
         self._bench.advance(now)
@@ -155,11 +163,3 @@ class AmplifierDevice:
     def _plug(self, *, is_plugged: bool) -> None:
         for on_plug in [*self.plug_listeners]:
             on_plug(is_plugged)
-
-
-_Edge: TypeAlias = Literal["begin", "half", "end"]
-_TEMPERATURES: dict[_Edge, float] = {
-    "begin": DERATE_ABOVE + 1,
-    "half": FAULT_ABOVE + 1,
-    "end": AMBIENT,
-}

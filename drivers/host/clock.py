@@ -246,13 +246,14 @@ class _LeadFit(NamedTuple):
 
 
 class _Moments(NamedTuple):
-    """Sums over leads y and times x, both relative to their means; z = x^2 - mean(x^2)."""
+    """Sums over leads y at times x relative to the mean time; z = x^2 - mean(x^2)."""
 
     mean_lead: float
     mean_age: float
     xx: float
     xy: float
     yy: float
+    """The sum of (y - mean(y))^2."""
     zy: float
     zz: float
 
@@ -260,24 +261,23 @@ class _Moments(NamedTuple):
 def _moments(leads: Sequence[tuple[float, float]]) -> _Moments:
     """Return the moments of leads [s], which are given with their ages [s]."""
     count = len(leads)
-    lead_sum = age_sum = 0.0
+    mean_lead = mean_age = 0.0
     for lead, age in leads:
-        lead_sum += lead
-        age_sum += age
-    mean_lead = lead_sum / count
-    mean_age = age_sum / count
-    xx = xy = yy = xxy = xxxx = 0.0
+        mean_lead += lead / count
+        mean_age += age / count
+    xx = xy = yy = 0.0
     for lead, age in leads:
         x = mean_age - age
         y = lead - mean_lead
-        x_squared = x * x
-        xx += x_squared
+        xx += x**2
         xy += x * y
-        yy += y * y
-        xxy += x_squared * y
-        xxxx += x_squared * x_squared
-    # The sum of y is 0, so z y and x^2 y have the same sum.
-    return _Moments(mean_lead, mean_age, xx, xy, yy, xxy, xxxx - xx * xx / count)
+        yy += y**2
+    zy = zz = 0.0
+    for lead, age in leads:
+        z = (mean_age - age) ** 2 - xx / count
+        zy += z * lead
+        zz += z**2
+    return _Moments(mean_lead, mean_age, xx, xy, yy, zy, zz)
 
 
 def _aged_leads(readings: Iterable[_Reading], time: float) -> list[tuple[float, float]]:

@@ -2,6 +2,7 @@
 // per line, over the daemon's Unix socket. It uses nothing but Node.js itself, 18 or newer.
 
 import { EventEmitter } from "node:events";
+import { existsSync } from "node:fs";
 import { connect } from "node:net";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
@@ -23,8 +24,10 @@ function requireFinite(values) {
 /** The socket of this user's daemon, as `era status` finds it. */
 export function defaultSocket(environment = process.env) {
   if (environment.ERA_HAPTICS_SOCKET) return environment.ERA_HAPTICS_SOCKET;
-  const folder = environment.XDG_RUNTIME_DIR ?? `/run/user/${process.getuid()}`;
-  return join(folder, "era-haptics", "daemon.sock");
+  const user = process.getuid();
+  const folder = environment.XDG_RUNTIME_DIR || `/run/user/${user}`;
+  if (environment.XDG_RUNTIME_DIR || existsSync(folder)) return join(folder, "era-haptics", "daemon.sock");
+  return join(tmpdir(), `era-haptics-${user}`, "daemon.sock");
 }
 
 /** A request that the daemon refused; code: see "errors" on the page of the API. */

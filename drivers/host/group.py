@@ -29,18 +29,11 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier, IsPreempted
-from drivers.host.joint_sets import (
-    Clocks,
-    JointSets,
-    Members,
-    PlayedSet,
-    commit_of,
-    is_lost,
-    outcomes,
-    word_passed_by_all,
-)
+from drivers.host.group_clocks import Clocks
+from drivers.host.joint_sets import JointSets, PlayedSet, commit_of, word_passed_by_all
 from drivers.host.ledger import StopOutcome
 from drivers.host.line import GRACE, Line, Make, Priority
+from drivers.host.members import Members, is_lost, outcomes
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, HEARTBEAT, QUANTITIES, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values

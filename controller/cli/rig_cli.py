@@ -34,7 +34,7 @@ _NOT_EXPLAINED = (
 _NOT_KNOWN = (
     "modes must match the rig's plate within 2 standard deviations; no rig is written. The fields "
     "between the sensors are unknown: remove parts bonded to the plate, such as a frame along its "
-    "edges, or use the rig unchanged; sensors inside the plate locate the difference"
+    "edges, or use the rig unchanged; sensors away from the edges locate the difference"
 )
 
 

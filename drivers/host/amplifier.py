@@ -213,7 +213,7 @@ class Amplifier:
     # Sets
     played_at: float = -math.inf
     """Earliest start [s] of the last set sent, or the time when silence was sent."""
-    starts: float = -math.inf
+    _starts_at: float = -math.inf
     """Start time [s] of the staged set if committed next; a time in the past: immediately."""
     committed: int = 0
     """Token of the set that it committed last; 0 if it committed none since it was armed."""
@@ -365,6 +365,10 @@ class Amplifier:
             raise CommandRefused(f"a set must have at most {max_words} words, got {len(stream)}")
         return _CheckedSet(layers, admitted, stream, delay, moment + valid_for)
 
+    def set_start(self, moment: float | None) -> None:
+        """Set when the staged set starts [s] once it is committed; None: immediately."""
+        self._starts_at = -math.inf if moment is None else moment
+
     def commit(self, token: int, at: int) -> asyncio.Future[Values]:
         """Play the staged set; returns a future of the status, which shows the tokens.
 
@@ -465,18 +469,18 @@ class Amplifier:
             feeding.fade = 0.0
 
     def _note_commit(self, admitted: StagedSet, now: float, arrives: float) -> None:
-        """Note the commit of a set, which starts at `starts`, or when the commit arrives."""
+        """Note the commit of a set, which starts at `_starts_at`, or when the commit arrives."""
         error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
         self._is_start_known = error <= _MAX_START_ERROR
         self._may_wait_until = now + MAX_AHEAD
-        if self.starts <= now:
+        if self._starts_at <= now:
             self.played_at = arrives
             self.ledger.sent(admitted.token, admitted.layers, now)
             return
-        self.played_at = self.starts
+        self.played_at = self._starts_at
         start_error = min(max(error, HIGH_TIME), _MAX_START_ERROR)
         self.ledger.sent(
-            admitted.token, admitted.layers, now, starts=self.starts, error=start_error
+            admitted.token, admitted.layers, now, starts=self._starts_at, error=start_error
         )
 
     def _note_immediate_start(self, admitted: StagedSet, now: float, arrives: float) -> None:

@@ -84,7 +84,7 @@ class Heartbeats:
         """
         by_line: dict[Line, list[Amplifier]] = {}
         mute_lines: set[Line] = set()
-        for amplifier in self._members.by_need:
+        for amplifier in self._members.by_last_feeding:
             line = amplifier.line
             if (amplifier.silence_cause or line.loss) and is_lost(amplifier):
                 # Raised before awaiting the others, so that they are stopped immediately.
@@ -304,7 +304,7 @@ class Group:
                     return
                 self._leave_armed()
                 epoch = members.epoch
-                await members.silence(self._disarm, amplifiers, STOP_RAMP)
+                await members.start_silencing(self._disarm, amplifiers, STOP_RAMP)
                 members.check_none_since(epoch)
             for amplifier in amplifiers:
                 # If this came later, the disarm after a failure would end another host's vibration.
@@ -342,7 +342,7 @@ class Group:
             members.checked(await asyncio.shield(arming))
             members.check_none_since(epoch)
         except BaseException as error:
-            await members.silence(self._disarm_armed, arming)
+            await members.start_silencing(self._disarm_armed, arming)
             if isinstance(error, DriverError):
                 members.check_none_since(epoch)
             self._note(error)  # only now: an amplifier that replied to the disarm is not lost
@@ -422,7 +422,6 @@ class Group:
                     done = await exchange()
             finally:
                 self._limit = None
-                members.has_joint_set = False
         except Exception as error:
             self._note(error)
             has_lost = isinstance(error, LinkTimeout) and self.state is GroupState.LOST
@@ -449,7 +448,7 @@ class Group:
         It runs to completion if its caller is cancelled. If one amplifier fails, all are stopped.
         """
         self._leave_armed()
-        await self.members.silence(self._disarm, [*self.amplifiers.values()], ramp)
+        await self.members.start_silencing(self._disarm, [*self.amplifiers.values()], ramp)
 
     async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
         retried = self.members.retried
@@ -488,7 +487,7 @@ class Group:
                 stops[name] = asyncio.get_running_loop().create_future()
                 stops[name].set_exception(error)
         names = stops if waits_for is None else waits_for
-        return members.silence(members.stopped, {name: stops[name] for name in names})
+        return members.start_silencing(members.stopped, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults that no longer exist.
@@ -541,7 +540,7 @@ class Group:
                     amplifiers.append(amplifier)
             try:
                 if amplifiers:
-                    await self.members.silence(self._disarm, amplifiers, ramp)
+                    await self.members.start_silencing(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
             if self.members.silencing:  # no line may be closed before that has ended

@@ -12,13 +12,12 @@ import math
 from collections.abc import Awaitable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
 
 from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
 from drivers.host.amplifier import COMMITTING, Amplifier, IsPreempted
 from drivers.host.ledger import StagedSet, is_silence
 from drivers.host.line import Line, Priority
-from drivers.host.members import Members, need, outcomes
+from drivers.host.members import Members, last_fed_at, outcomes
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     AHEAD_MAX,
@@ -69,8 +68,9 @@ class JointSets:
     @property
     def is_in_doubt(self) -> bool:
         """Whether it is unknown if all amplifiers play the last set, which is then silenced."""
-        amplifiers = self._members.amplifiers.values()
-        return self.is_incomplete or any(map(attrgetter("is_in_doubt"), amplifiers))
+        if self.is_incomplete:
+            return True
+        return any(amplifier.is_in_doubt for amplifier in self._members.amplifiers.values())
 
     def refusal_of(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
@@ -97,8 +97,22 @@ class JointSets:
         Preempted is returned if a lost commit is too late to be repeated; all are silent then.
         Overtaken is returned if the set is preempted before its commit.
         """
-        amplifiers = sorted([self._members.amplifiers[name] for name in layers], key=need)
-        self._members.has_joint_set = len({amplifier.line for amplifier in amplifiers}) > 1
+        members = self._members
+        amplifiers = [members.amplifiers[name] for name in layers]
+        amplifiers.sort(key=last_fed_at)
+        members.has_joint_set = len({amplifier.line for amplifier in amplifiers}) > 1
+        try:
+            return await self._stage_and_commit(amplifiers, layers, is_preempted)
+        finally:
+            members.has_joint_set = False
+
+    async def _stage_and_commit(
+        self,
+        amplifiers: Sequence[Amplifier],
+        layers: Mapping[str, Sequence[AmplifierLayer]],
+        is_preempted: IsPreempted | None,
+    ) -> PlayedSet | DriverError:
+        """Stage and commit layers as `play` does; amplifiers: in the order of staging."""
         epoch = self._members.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
@@ -197,7 +211,7 @@ class JointSets:
     async def silence(self, ramp: float) -> None:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
         # Mute amplifiers come last, so that no other amplifier on the same line waits for them.
-        amplifiers = self._members.by_need
+        amplifiers = self._members.by_last_feeding
         amplifiers.sort(key=lambda amplifier: amplifier.silence_cause is not None)
         await self._members.all([amplifier.silence(ramp) for amplifier in amplifiers])
         self.is_incomplete = False
@@ -218,7 +232,7 @@ class JointSets:
             )
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
         for amplifier in staged:
-            amplifier.starts = -math.inf if moment is None else moment
+            amplifier.set_start(moment)
         if moment is None:
             words = dict.fromkeys(staged, word_passed_by_all(threads.now(), [*staged]))
         else:
@@ -345,7 +359,7 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
     token, the commit is repeated once. The ledger compares what its layers play with each status.
     """
     if amplifier.committed != token and status["state"] not in LATCHED:
-        amplifier.starts = -math.inf
+        amplifier.set_start(None)
         status = await amplifier.commit(token, word_passed_by_all(threads.now(), [amplifier]))
     if amplifier.committed != token or status["state"] in LATCHED:
         raise CommandRefused(

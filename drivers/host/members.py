@@ -7,7 +7,6 @@ reply. Stops and disarms start immediately and run to completion.
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from operator import attrgetter
 from typing import Any, ParamSpec, TypeVar, cast
 
 from drivers.errors import LinkError, LinkTimeout, Preempted
@@ -20,9 +19,6 @@ from registry import threads
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-need = attrgetter("feeding.since")
-_lost_from = attrgetter("feeding.lost_from")
-_silence_cause = attrgetter("silence_cause")
 
 
 class Members:
@@ -33,7 +29,10 @@ class Members:
         self.epoch = 0
         """Number of stops, disarms and closes; what began before one must not arm, play or feed."""
         self.has_joint_set = False
-        """Whether a set for several lines is under way; no clock is read meanwhile."""
+        """Whether a set for several lines is under way; no clock is read meanwhile.
+
+        Only `JointSets.play` changes it.
+        """
         self.gives_up_at = math.inf
         """When requests are no longer repeated [s], because all is being closed."""
         self.silencing: set[asyncio.Future[Any]] = set()
@@ -46,15 +45,19 @@ class Members:
         return tuple(dict.fromkeys([amplifier.line for amplifier in self.amplifiers.values()]))
 
     @property
-    def by_need(self) -> list[Amplifier]:
+    def by_last_feeding(self) -> list[Amplifier]:
         """All amplifiers; the least recently fed is first, because replies may be late."""
-        return sorted(self.amplifiers.values(), key=need)
+        return sorted(self.amplifiers.values(), key=last_fed_at)
+
+    @property
+    def _mute(self) -> list[Amplifier]:
+        """The amplifiers that do not reply."""
+        return [amplifier for amplifier in self.amplifiers.values() if amplifier.silence_cause]
 
     @property
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        mute = filter(_silence_cause, self.amplifiers.values())
-        return tuple([amplifier.name for amplifier in mute if not is_lost(amplifier)])
+        return tuple([amplifier.name for amplifier in self._mute if not is_lost(amplifier)])
 
     @property
     def lost_by(self) -> Mapping[str, str]:
@@ -68,8 +71,8 @@ class Members:
     @property
     def lost_from(self) -> float:
         """When an amplifier that does not reply is lost [s]; the next beat then stops all."""
-        mute = filter(_silence_cause, self.amplifiers.values())
-        return min(map(_lost_from, mute), default=math.inf)
+        times = [amplifier.feeding.lost_from for amplifier in self._mute]
+        return min(times, default=math.inf)
 
     @property
     def last_sent_at(self) -> float:
@@ -120,7 +123,7 @@ class Members:
                     raise
                 await asyncio.sleep(_REPEAT_INTERVAL)
 
-    def silence(
+    def start_silencing(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
         """Start a stop or disarm, which runs to completion in spite of cancellation."""
@@ -177,6 +180,11 @@ async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException
         except Exception as error:
             results.append(error)
     return results
+
+
+def last_fed_at(amplifier: Amplifier) -> float:
+    """Return when an amplifier's watchdog was last surely fed [s]."""
+    return amplifier.feeding.since
 
 
 def is_lost(amplifier: Amplifier) -> bool:

@@ -181,9 +181,8 @@ class Group:
             await members.start_silencing(self._disarm_armed, arming)
             if isinstance(error, DriverError):
                 members.check_none_since(epoch)
-            self._lose_if_shown_by(
-                error
-            )  # only now: an amplifier that replied to the disarm is not lost
+            # Only now: an amplifier that replied to the disarm is not lost.
+            self._lose_if_shown_by(error)
             if members.is_degraded_only(error):
                 raise LinkDegraded(str(error)) from error
             if members.lost_by:

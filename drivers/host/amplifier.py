@@ -42,14 +42,7 @@ from drivers.host.ledger import (
     check_capabilities,
     check_identity,
 )
-from drivers.host.line import (
-    Line,
-    LinkStatistics,
-    Priority,
-    contradicted,
-    disarmed,
-    driven_by_another,
-)
+from drivers.host.line import Line, LinkStatistics, Priority
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     ATTEMPTS,
@@ -58,6 +51,7 @@ from drivers.protocol.definition import (
     ENVELOPE,
     EVENT_RECORD,
     FAST,
+    FAULTS,
     HIGH_TIME,
     KNOT,
     LATCHED,
@@ -70,6 +64,7 @@ from drivers.protocol.definition import (
     STATES,
     STATUS,
     STOP_RAMP,
+    name_of,
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
@@ -312,7 +307,7 @@ class Amplifier:
         else:
             problem = f"a set with token {token} must be taken, got token {reply['token']}"
             # This is not a rejection: the group stops all amplifiers.
-            raise FrameError(str(contradicted(self.name, problem)))
+            raise FrameError(str(_contradicted(self.name, problem)))
         staged = request.staged
         is_staged = reply["staged"] and not now and self._admitted is staged
         if staged is None or not (reply["played"] or is_staged):
@@ -408,7 +403,7 @@ class Amplifier:
                 "passed; nothing new is played until it replies"
             )
         if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
-            raise disarmed(self.name, self.status)
+            raise _disarmed(self.name, self.status)
         return duration
 
     def _check_admitted(self, token: int, priority: Priority) -> None:
@@ -543,7 +538,7 @@ class Amplifier:
         if ledger is not None and is_sure:
             self._confirm(status["token"], now)
         if name == "Ping" and not is_enabled:
-            raise disarmed(self.name, status)
+            raise _disarmed(self.name, status)
         if ledger is not None and self.session and is_enabled and name not in ("Arm", "Clear"):
             self._compare(ledger, status, sent_at, now, is_fed=MESSAGES[name].feeds)
 
@@ -568,7 +563,7 @@ class Amplifier:
             self.contradictions += 1
             self._contradicted_at = now
             if self.contradictions >= MAX_CONTRADICTIONS:
-                raise contradicted(self.name, problem)
+                raise _contradicted(self.name, problem)
 
     def _problem_of(
         self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool
@@ -648,7 +643,7 @@ class Amplifier:
     def check_other_host(self) -> None:
         """Raise LinkError if another host was heard within the longest time of a watchdog."""
         if self._time() - self._other_host_at <= _WATCHDOG.high:
-            raise driven_by_another(self.name)
+            raise _driven_by_another(self.name)
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier has reported the set with this token as the one it plays."""
@@ -757,7 +752,7 @@ class Amplifier:
         self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:
-            raise disarmed(self.name, status)
+            raise _disarmed(self.name, status)
         return status
 
     async def read_achieved(self, layer: LayerSet, token: int) -> LayerSet:
@@ -779,7 +774,7 @@ class Amplifier:
         self._misachieved += 1
         if self._misachieved >= MAX_CONTRADICTIONS:
             _, quantity, must, got = problem
-            raise contradicted(
+            raise _contradicted(
                 self.name, f"{quantity} in layer {layer.layer} must be {must}, got {got}"
             )
         return achieved
@@ -919,7 +914,7 @@ class Amplifier:
             status = await self.read_status()
             self.check_other_host()
             if status["watchdog_left"] > left:
-                raise driven_by_another(self.name)
+                raise _driven_by_another(self.name)
             left = status["watchdog_left"]
 
 
@@ -940,3 +935,28 @@ def _is_stopping(status: Values, last_latch: int | None) -> bool:
     if last_latch is None or status["state"] not in LATCHED:
         return False
     return status["latch"] > 0 and is_newer_token(status["latch"], last_latch)
+
+
+def _contradicted(name: str, problem: str) -> CommandRefused:
+    """Return the error of an amplifier that contradicts its requests again and again."""
+    return CommandRefused(
+        f"amplifier {name} contradicts its requests: {problem}; look for a derated or broken "
+        "channel, an exchanged cable or firmware, then clear and arm again"
+    )
+
+
+def _disarmed(name: str, status: Values) -> CommandRefused:
+    """Return the error of a request that needs an armed amplifier, if a status shows another state.
+
+    name: of the amplifier.
+    """
+    return CommandRefused(
+        f"amplifier {name} is not armed but in {name_of(STATES, status['state'])}, fault "
+        f"{name_of(FAULTS, status['fault'])}; once the cause is gone, clear and arm again",
+        is_disarmed=True,
+    )
+
+
+def _driven_by_another(name: str) -> WrongAmplifier:
+    """Return the error of an amplifier that another host drives."""
+    return WrongAmplifier(f"amplifier {name} is driven by another host; end that one first")

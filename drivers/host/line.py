@@ -23,19 +23,15 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
     WireCounters,
-    WrongAmplifier,
 )
 from drivers.ports import OpenPort
 from drivers.protocol.definition import (
     ATTEMPTS,
     BROADCAST,
     FAST,
-    FAULTS,
     MESSAGES,
     REACTION,
     REPLY_TIMEOUT,
-    STATES,
-    name_of,
 )
 from drivers.protocol.records import Values
 from drivers.trace import Direction
@@ -98,31 +94,6 @@ def no_reply(
     return cause
 
 
-def contradicted(name: str, problem: str) -> CommandRefused:
-    """Return the error of an amplifier that contradicts its requests again and again."""
-    return CommandRefused(
-        f"amplifier {name} contradicts its requests: {problem}; look for a derated or broken "
-        "channel, an exchanged cable or firmware, then clear and arm again"
-    )
-
-
-def disarmed(name: str, status: Values) -> CommandRefused:
-    """Return the error of a request that needs an armed amplifier, if a status shows another state.
-
-    name: of the amplifier.
-    """
-    return CommandRefused(
-        f"amplifier {name} is not armed but in {name_of(STATES, status['state'])}, fault "
-        f"{name_of(FAULTS, status['fault'])}; once the cause is gone, clear and arm again",
-        is_disarmed=True,
-    )
-
-
-def driven_by_another(name: str) -> WrongAmplifier:
-    """Return the error of an amplifier that another host drives."""
-    return WrongAmplifier(f"amplifier {name} is driven by another host; end that one first")
-
-
 MAX_WAIT = 0.05  # s; a request that has waited for longer is sent before newer sets and heartbeats
 
 
@@ -138,6 +109,9 @@ class Priority(IntEnum):
     OTHER = 6
     READING = 7
 
+
+_NONE_WAITING = max(Priority) + 1
+"""In place of a priority, if no request waits: less urgent than all priorities."""
 
 _SUPERSEDED = {
     # A queued heartbeat would feed the watchdog of an amplifier that did not receive the stop.
@@ -245,8 +219,8 @@ class Job:
             self.reached = part
             self.attempts = ATTEMPTS
 
-    def is_missing(self, reply: Values) -> bool:
-        """Go back to the first part that a reply reports as missing; False without one."""
+    def go_back_to_missing(self, reply: Values) -> bool:
+        """Go back to the first part that a reply reports as missing; return False without one."""
         missing = reply["missing"]
         if reply["staged"] or reply["played"] or missing >= self.part:
             return False
@@ -342,6 +316,10 @@ class Line:
 
         It returns the commit that is broadcast on the line first, or None.
         """
+        self._port: OpenPort
+        """The open port; set by `open`."""
+        self._commit_takes: float
+        """Duration of a commit on the wire [s]; set by `open`."""
         self._queue = JobQueue()
         self.current: Job | None = None
         """The request on the line; None if the line is free."""
@@ -469,7 +447,7 @@ class Line:
             return
         if job.result.done():  # its caller was cancelled
             return
-        if len(job.parts) < 2 or not job.is_missing(reply):
+        if len(job.parts) < 2 or not job.go_back_to_missing(reply):
             job.result.set_result(reply)
         elif job.attempts > 0:
             self._repeat(job, member)
@@ -514,7 +492,9 @@ class Line:
         """
         member = job.member
         try:
-            data = self._bytes_of(job)
+            self._send_ahead(job)
+            self._make(job)
+            data = self._encoded(job)
             now = self.time()
             begins = max(now, self._sent_until)  # after bytes still under way
             job.sent_at = now
@@ -555,22 +535,29 @@ class Line:
             return
         self._await_reply(job, now, begins)
 
-    def _bytes_of(self, job: Job) -> bytes:
-        """Return the bytes of a request, after sending the broadcast that precedes it, if any."""
-        member = job.member
-        if self.ahead is not None and member is not None and not job.part:
-            make_commit = self.ahead(job.name, job.priority)
-            if make_commit is not None:
-                now = self.time()
-                self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, 0.0, now, make_commit))
+    def _send_ahead(self, job: Job) -> None:
+        """Send the commit that is broadcast before a request to one amplifier, if there is one."""
+        if self.ahead is None or job.member is None or job.part:
+            return
+        make_commit = self.ahead(job.name, job.priority)
+        if make_commit is not None:
+            now = self.time()
+            self._start(Job(None, Priority.HEARTBEAT, "Commit", {}, 0.0, now, make_commit))
+
+    def _make(self, job: Job) -> None:
+        """Make the messages of a request at its first turn, and check the one to be sent next."""
         if job.attempts == ATTEMPTS:
             self.wire.counters.remark = ""
         if job.make is not None:
             job.parts = job.make()
             job.make = None
             job.values = job.parts[0]
-        if member is not None:
-            job.takes = member.next_request(job.name, job.values, job.priority)
+        if job.member is not None:
+            job.takes = job.member.next_request(job.name, job.values, job.priority)
+
+    def _encoded(self, job: Job) -> bytes:
+        """Return the bytes of the message of a request that is sent next."""
+        member = job.member
         has_reply = member is not None and job.part >= len(job.parts) - 1
         return self.wire.request(_address_of(member), job.name, job.values, has_reply=has_reply)
 
@@ -691,7 +678,7 @@ class Line:
             self._send_further(current)
             return
         waiting = [job.priority for job in self._queue if job.priority < current.priority]
-        first = min(waiting, default=8)
+        first = min(waiting, default=_NONE_WAITING)
         is_reading = current.priority is Priority.READING
         free_at = max(self.time(), self._free_at)
         if first <= Priority.SILENCE:

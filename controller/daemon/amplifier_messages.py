@@ -50,7 +50,7 @@ def amplifier_statuses(
         is_degraded = False
         if amplifier is not None and are_open and not is_lost(amplifier):
             status = amplifier.status
-            is_degraded = amplifier.silence_cause is not None
+            is_degraded = amplifier.no_reply_cause is not None
         has_status = status is not None
         is_closed_with_lost = lost is not None and bool(lost.names) and name not in lost.names
         silence: AmplifierSilence | None = None

@@ -270,7 +270,7 @@ async def _identified(
 ) -> Mapping[str, StopOutcome]:
     """Await a stop while identifying amplifiers: unknown amplifiers confirm nothing."""
     for amplifier in amplifiers:
-        amplifier.capabilities = {}
+        amplifier.forget_capabilities()
     requests = [amplifier.identify(timeout=REPLY_TIMEOUT) for amplifier in amplifiers]
     identifying = asyncio.gather(*requests, return_exceptions=True)
     try:

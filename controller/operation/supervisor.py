@@ -551,10 +551,10 @@ class Supervisor:
         if degraded:
             change = "degraded"
             level = logging.WARNING
-            silence_cause = group.amplifiers[degraded[0]].silence_cause
+            no_reply_cause = group.amplifiers[degraded[0]].no_reply_cause
             cause = (
                 f"amplifier {', '.join(degraded)} does not reply; nothing new is played: "
-                f"{silence_cause}"
+                f"{no_reply_cause}"
             )
             remedy = "check cables and supply"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))

@@ -197,7 +197,7 @@ class Amplifier:
     may_be_armed: bool = False
     """Whether it may have carried out an Arm of this host since it was last disarmed."""
     arming: tuple[int, float] = (0, -math.inf)
-    """`silences` when Arm was requested, and the time [s] until which the Arm may go out."""
+    """`stops_sent` when Arm was requested, and the time [s] until which the Arm may go out."""
     armed_latch: int | None = None
     """Latch in the reply to the last Arm."""
     feeding: Feeding
@@ -227,9 +227,9 @@ class Amplifier:
     stop_outcome: StopOutcome = UNREACHED
     """Its possible output after the last stop, without the evidence of statuses and watchdog;
     `what_may_play` has the conclusion."""
-    silence_cause: str | None = None
+    no_reply_cause: str | None = None
     """Why it is degraded: it did not reply to a request, and may still play."""
-    silences: int = 0
+    stops_sent: int = 0
     """Number of stops and disarms that were sent to it."""
     _stop: PendingStop | None = None
     """The last stop, which later callers join until it was sent."""
@@ -373,38 +373,40 @@ class Amplifier:
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 
-    def next_request(self, name: str, values: Values, priority: Priority) -> float:
-        """Return how long a request and its reply take on the wire [s].
-
-        Raises if the request would play or feed and must not be sent: LinkError while the amplifier
-        is degraded or driven by another host, CommandRefused once a status has shown that it is not
-        armed. For a set and its commit it raises Preempted if the set is no longer admitted, and
-        CommandRefused if it is too late.
-        """
+    def request_time(self, name: str, values: Values) -> float:
+        """Return how long a request and its reply take on the wire [s]."""
         duration = self.exchange_time(name)
         if name == "Set" and duration > FAST:  # most sets are much shorter than the longest one
             words = SET_WORDS + len(values["stream"])
             duration = self.line.wire.exchange_time(words, reply_words("Set"))
+        return duration
+
+    def check_may_send(self, name: str, values: Values, priority: Priority) -> None:
+        """Raise if a request would play or feed and must not be sent.
+
+        Raises LinkError while the amplifier is degraded or driven by another host, CommandRefused
+        once a status has shown that it is not armed. For a set and its commit it raises Preempted
+        if the set is no longer admitted, and CommandRefused if it is too late.
+        """
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
-            return duration
+            return
         if name == "Set" or (name == "Commit" and values["token"] != self.committed):
             self._check_admitted(values["token"], priority)
         if name == "Arm":
-            silences, until = self.arming
-            if self.silences != silences:
+            stops_sent, until = self.arming
+            if self.stops_sent != stops_sent:
                 raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
             if self._time() > until:  # this machine slept, and the caller does not expect it now
                 raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
         if self._other_host_at > -math.inf:
             self.check_other_host()
-        if self.silence_cause is not None:
+        if self.no_reply_cause is not None:
             raise LinkDegraded(
-                f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
-                "passed; nothing new is played until it replies"
+                f"{self.no_reply_cause}. The amplifier may play its last set until its watchdog "
+                "has passed; nothing new is played until it replies"
             )
         if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
             raise _disarmed(self.name, self.status)
-        return duration
 
     def _check_admitted(self, token: int, priority: Priority) -> None:
         """Raise Preempted or CommandRefused unless the set with a token may be sent now."""
@@ -431,7 +433,7 @@ class Amplifier:
             self._note_possible_feeding(name, values, now, arrives)
         elif name in ("Stop", "Disarm"):
             self.feeding.fade = max(self.feeding.fade, _RAMP.from_wire(values["ramp"]))
-            self.silences += 1
+            self.stops_sent += 1
         admitted = self._admitted
         if name == "Arm":
             self._admitted = None
@@ -454,7 +456,7 @@ class Amplifier:
         """Note a request that feeds the watchdog if it arrives."""
         feeding = self.feeding
         feeding.may = now
-        if name == "Silence" and self.silence_cause is not None:
+        if name == "Silence" and self.no_reply_cause is not None:
             # If it arrives, it does so within the time of the watchdog, and its ramp follows.
             # Repeating it without reply does not put off when the amplifier must be silent.
             feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
@@ -637,7 +639,7 @@ class Amplifier:
                 until = status_at if until == math.inf else max(until, status_at)
             elif (is_armed or any(status["levels"])) and status_at >= until:
                 until = math.inf
-        cause = cause or self.line.loss or self.silence_cause or ""
+        cause = cause or self.line.loss or self.no_reply_cause or ""
         return StopOutcome(False, math.inf if until == -math.inf else until, cause)
 
     def check_other_host(self) -> None:
@@ -687,7 +689,7 @@ class Amplifier:
         self._check_alone()
         # Until identified, it may be another amplifier, whose silence confirms nothing.
         last_capabilities = self.capabilities
-        self.capabilities = {}
+        self.forget_capabilities()
         check_identity(identity, self.name, self._serial_number)
         self.capabilities = last_capabilities
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
@@ -705,10 +707,14 @@ class Amplifier:
         self.latch = None
         return await self.read_status()
 
+    def forget_capabilities(self) -> None:
+        """Forget the capabilities, so that no status confirms silence until it is identified."""
+        self.capabilities = {}
+
     def _check_alone(self) -> None:
         """Raise LinkError if several amplifiers replied: the silence of one proves nothing."""
         if self._are_several:
-            self.capabilities = {}
+            self.forget_capabilities()
             raise WrongAmplifier(
                 f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
                 f"{self.line.name}; give each its own: era amp address --serial-number"
@@ -720,7 +726,7 @@ class Amplifier:
         Identifies the amplifier again, because it may have lost power and returned with other
         limits. A stop or disarm that comes after this call goes first, even before it is awaited.
         """
-        self.arming = self.silences, threads.now() + _ARM_WITHIN
+        self.arming = self.stops_sent, threads.now() + _ARM_WITHIN
         return self._arm(session, watchdog)
 
     async def _arm(self, session: int, watchdog: float) -> Values:
@@ -823,12 +829,12 @@ class Amplifier:
 
         Identifies the amplifier again: after a loss of power it counts latches from 1.
         """
-        last_silences = self.silences
+        last_stops_sent = self.stops_sent
         last_latch = self.latch
         status = await self.identify(timeout=REPLY_TIMEOUT)
         has_restarted = last_latch is None or is_newer_token(last_latch, status["latch"])
         latch = status["latch"] if has_restarted else last_latch
-        if self.silences != last_silences:
+        if self.stops_sent != last_stops_sent:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         self.stop_outcome = replace(self.stop_outcome, is_confirmed=False)
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)

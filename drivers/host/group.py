@@ -272,7 +272,7 @@ class Group:
             if is_explained and isinstance(error, DriverError):
                 raise Preempted("a stop or disarm came first") from error
             amplifiers = self.amplifiers
-            replying = [name for name in amplifiers if not amplifiers[name].silence_cause]
+            replying = [name for name in amplifiers if not amplifiers[name].no_reply_cause]
             await self.stop(waits_for=replying)
             if has_lost:  # even if the amplifier was only degraded when the exchange began
                 raise LinkTimeout(next(iter(members.lost_by.values()), str(error))) from error

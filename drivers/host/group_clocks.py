@@ -201,7 +201,7 @@ class Clocks:
         """Read the status of an amplifier, if it replies, can be steered and is not being read."""
         reading = self._readings.get(amplifier)
         is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
-        is_heard = amplifier.silence_cause is None and amplifier.line.loss is None
+        is_heard = amplifier.no_reply_cause is None and amplifier.line.loss is None
         if is_free and is_heard and not self._members.has_joint_set:
             self._readings[amplifier] = amplifier.read_status(Priority.READING)
 

@@ -68,11 +68,11 @@ class Heartbeats:
         mute_lines: set[Line] = set()
         for amplifier in self._members.by_last_feeding:
             line = amplifier.line
-            if (amplifier.silence_cause or line.loss) and is_lost(amplifier):
+            if (amplifier.no_reply_cause or line.loss) and is_lost(amplifier):
                 # Raised before awaiting the others, so that they are stopped immediately.
-                raise LinkTimeout(line.loss or amplifier.silence_cause)
+                raise LinkTimeout(line.loss or amplifier.no_reply_cause)
             by_line.setdefault(line, []).append(amplifier)
-            if amplifier.silence_cause is not None:
+            if amplifier.no_reply_cause is not None:
                 mute_lines.add(line)
         self._clocks.look({line: by_line[line] for line in by_line if line not in mute_lines})
         feeds: list[Feed] = []
@@ -94,7 +94,7 @@ class Heartbeats:
         token = 0
         feeds: list[Feed] = []
         for amplifier in line_amplifiers:
-            if amplifier.silence_cause is not None:
+            if amplifier.no_reply_cause is not None:
                 self._listen(amplifier)
                 continue
             feed: Feed = amplifier.ping

@@ -212,7 +212,7 @@ class JointSets:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
         # Mute amplifiers come last, so that no other amplifier on the same line waits for them.
         amplifiers = self._members.by_last_feeding
-        amplifiers.sort(key=lambda amplifier: amplifier.silence_cause is not None)
+        amplifiers.sort(key=lambda amplifier: amplifier.no_reply_cause is not None)
         await self._members.all([amplifier.silence(ramp) for amplifier in amplifiers])
         self.is_incomplete = False
 
@@ -348,7 +348,7 @@ def commit_of(amplifiers: Sequence[Amplifier], token: int, at: int) -> list[Valu
     """Return a commit for several amplifiers of a line; raises unless it is allowed for all."""
     values = {"session": amplifiers[0].session, "token": token, "at": at}
     for amplifier in amplifiers:
-        amplifier.next_request("Commit", values, Priority.SET)
+        amplifier.check_may_send("Commit", values, Priority.SET)
     return [values]
 
 

@@ -149,14 +149,14 @@ class Member(Protocol):
     name: str
     address: int
     counts: LinkStatistics
-    silence_cause: str | None
+    no_reply_cause: str | None
     """Why the amplifier counts as mute, after a request without reply; None if it replies."""
 
-    def next_request(self, name: str, values: Values, priority: Priority) -> float:
-        """Return how long a request and its reply take on the wire [s].
+    def request_time(self, name: str, values: Values) -> float:
+        """Return how long a request and its reply take on the wire [s]."""
 
-        Raises DriverError if the request must not be sent.
-        """
+    def check_may_send(self, name: str, values: Values, priority: Priority) -> None:
+        """Raise DriverError if a request must not be sent."""
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and reaches the amplifier at a time [s]."""
@@ -426,7 +426,7 @@ class Line:
                 self._continue(job, arrival.data, is_present=arrival.is_present)
             return
         self.current = None
-        member.silence_cause = None
+        member.no_reply_cause = None
         if isinstance(arrival, WrittenPart):
             self._go_on(job)
             return
@@ -553,7 +553,8 @@ class Line:
             job.make = None
             job.values = job.parts[0]
         if job.member is not None:
-            job.takes = job.member.next_request(job.name, job.values, job.priority)
+            job.member.check_may_send(job.name, job.values, job.priority)
+            job.takes = job.member.request_time(job.name, job.values)
 
     def _encoded(self, job: Job) -> bytes:
         """Return the bytes of the message of a request that is sent next."""
@@ -573,7 +574,7 @@ class Line:
             self._port.write(data)
         except LinkTimeout as error:  # the port accepts nothing: the amplifier is degraded
             if member is not None:
-                member.silence_cause = str(error)
+                member.no_reply_cause = str(error)
             raise
         if self.loss is not None:  # the port was lost while it was written
             raise LinkError(self.loss)
@@ -753,7 +754,7 @@ class Line:
     def _give_up(self, job: Job, member: Member, *, boot_time: float = 0.0) -> None:
         """Fail a request that had no reply, or whose parts do not arrive."""
         remark = self.wire.blocked if self._port.is_blocked else self.wire.counters.remark
-        member.silence_cause = no_reply(
+        member.no_reply_cause = no_reply(
             self.name,
             job.name,
             job.timeout,
@@ -761,7 +762,7 @@ class Line:
             before=member.counts.last_round_trip or 0.0,
             boot_time=boot_time,
         )
-        self._fail(job, LinkTimeout(member.silence_cause))
+        self._fail(job, LinkTimeout(member.no_reply_cause))
 
 
 def _address_of(member: Member | None) -> int:

@@ -52,7 +52,7 @@ class Members:
     @property
     def _mute(self) -> list[Amplifier]:
         """The amplifiers that do not reply."""
-        return [amplifier for amplifier in self.amplifiers.values() if amplifier.silence_cause]
+        return [amplifier for amplifier in self.amplifiers.values() if amplifier.no_reply_cause]
 
     @property
     def degraded(self) -> tuple[str, ...]:
@@ -65,7 +65,7 @@ class Members:
         causes = {}
         for name, amplifier in self.amplifiers.items():
             if is_lost(amplifier):
-                causes[name] = amplifier.line.loss or amplifier.silence_cause or ""
+                causes[name] = amplifier.line.loss or amplifier.no_reply_cause or ""
         return causes
 
     @property
@@ -189,6 +189,6 @@ def last_fed_at(amplifier: Amplifier) -> float:
 
 def is_lost(amplifier: Amplifier) -> bool:
     """Whether an amplifier cannot be reached: its line is gone, or it is mute past its watchdog."""
-    if amplifier.silence_cause is None or amplifier.line.loss is not None:
+    if amplifier.no_reply_cause is None or amplifier.line.loss is not None:
         return amplifier.line.loss is not None
     return threads.now() >= amplifier.feeding.lost_from

@@ -617,7 +617,7 @@ async def test_error_of_no_reply_names_what_came_in_its_place(case: str) -> None
     end.outward = lambda name, data: [(0.0002, in_place(data))]
     with pytest.raises(LinkTimeout, match=f"no reply within 30 ms, but .*{named}"):
         await host.read_status()
-    assert re.search(named, host.silence_cause or "")
+    assert re.search(named, host.no_reply_cause or "")
     end.outward = unaltered
     await host.read_status()
     end.outward = lambda name, data: []

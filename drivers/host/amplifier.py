@@ -32,6 +32,7 @@ from drivers.host.clock import (
     armed_problem,
     reports_of,
 )
+from drivers.host.contradictions import MAX_CONTRADICTIONS, StatusContradictions
 from drivers.host.ledger import (
     UNREACHED,
     Feeding,
@@ -101,9 +102,6 @@ _RAMP = QUANTITIES["ramp"]
 _WATCHDOG = QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _WIRE_ROUNDING = 0.5  # steps of the wire, in addition to half a step of the amplifier
-MAX_CONTRADICTIONS = 2
-"""So many contradictions in a row are a fault; a single one may be a moment between two sets."""
-_SAME_MOMENT = 0.01  # s; contradictions of statuses closer to each other than this count once
 _LEFT = QUANTITIES["watchdog_left"]
 _SILENCING = ("Stop", "Disarm", "Silence")
 _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
@@ -178,12 +176,8 @@ class Amplifier:
     """Newest latch that a status has shown since it was identified."""
     reported_at: dict[ReportKind, float]
     """When a status last had a report of each kind [s]."""
-    contradictions: int = 0
-    """Number of contradictory statuses in a row."""
-    _contradicted_at: float = -math.inf
-    """When the last contradictory status came [s]."""
-    _was_unfed: bool = False
-    """Whether the last contradiction was in a status that does not feed."""
+    contradictions: StatusContradictions
+    """Statuses in a row that contradict the requests sent."""
     _misachieved: int = 0
     """Number of contradictory achieved layers in a row."""
     _other_host_at: float = -math.inf
@@ -252,6 +246,7 @@ class Amplifier:
         self.capabilities = {}
         self.identity = {}
         self.reported_at = {}
+        self.contradictions = StatusContradictions()
         self.listeners = []
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.clock = HeldClock()
@@ -556,16 +551,9 @@ class Amplifier:
         if problem is None:
             # The reply to a request that feeds does not show how the watchdog runs down.
             shows_watchdog = not is_fed and self.feeding.tells(sent_at)
-            if shows_watchdog or not self._was_unfed:
-                self.contradictions = 0
-                self._contradicted_at = -math.inf
-            return
-        self._was_unfed = not is_fed
-        if now - self._contradicted_at >= _SAME_MOMENT:
-            self.contradictions += 1
-            self._contradicted_at = now
-            if self.contradictions >= MAX_CONTRADICTIONS:
-                raise _contradicted(self.name, problem)
+            self.contradictions.note_agreement(shows_watchdog=shows_watchdog)
+        elif self.contradictions.note_contradiction(now, is_fed=is_fed):
+            raise _contradicted(self.name, problem)
 
     def _problem_of(
         self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool
@@ -754,7 +742,7 @@ class Amplifier:
         self.session = session
         self.feeding.watchdog = watchdog
         self.armed_latch = status["latch"]
-        self.contradictions = 0
+        self.contradictions.restart()
         self._misachieved = 0
         self.ledger.forget()
         if status["state"] != ENABLED:

@@ -304,7 +304,7 @@ async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> N
         for _ in range(4):
             await asyncio.sleep(rng.uniform(0.0, 0.02))
             shown.add((await host.read_status())["tokens"][0] > 0)
-            assert host.contradictions == 0
+            assert host.contradictions.count == 0
         end.inward = end.outward = unaltered
         await group.silence(0.0)
         await asyncio.sleep(0.1)

@@ -6,8 +6,7 @@ import logging
 import math
 from collections import defaultdict
 from collections.abc import AsyncIterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from model.finger import detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
+from registry.threads import in_thread
 
 _COLUMNS = 64  # grid points along the longer side; several per bending wavelength
 _MAX_FREQUENCIES = 64  # in the cache
@@ -30,6 +30,9 @@ _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no fields, scale 0
 _RETRY_INTERVAL = 0.5  # s; of connecting to the daemon
 _TOPICS = b'{"topics":["pattern","silence"]}'
 _LAYERS = TypeAdapter(dict[int, dict[str, PlayedTone]])
+
+_NOT_CONNECTED = "not connected to a daemon"
+_NOT_DRAWN = "field of the plate: not drawn"
 
 _logger = logging.getLogger(__name__)
 
@@ -99,7 +102,7 @@ class DrawnField:
         self._due = asyncio.Event()
         self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and drives by layer
         self._solver = lru_cache(1)(lambda text: FieldSolver(parse_rig("the daemon's rig", text)))
-        self._problem = ""
+        self._problems: dict[str, str] = {}  # logged reasons, by failure; removed when it ends
 
     async def frames(self) -> AsyncIterator[bytes]:
         """Yield the current frame, and then the newest whenever it changes."""
@@ -116,7 +119,7 @@ class DrawnField:
                 try:
                     await self._follow()
                 except Exception as error:
-                    self._note("not connected to a daemon", error)
+                    self._note(_NOT_CONNECTED, error)
                 self._show(None)
                 await asyncio.sleep(_RETRY_INTERVAL)
 
@@ -132,7 +135,7 @@ class DrawnField:
                     self._show((rig_text, received.data.get("layers", {})))
                 else:
                     result_of(received)  # raises if the daemon has too many clients
-                    self._problem = ""
+                    self._problems.pop(_NOT_CONNECTED, None)
         finally:
             link.abort()
 
@@ -142,17 +145,16 @@ class DrawnField:
 
     async def _draw(self) -> None:
         """Draw the playback after each change, in a thread because the first time takes a while."""
-        loop = asyncio.get_running_loop()
-        thread = ThreadPoolExecutor(1)
         while True:
             await self._due.wait()
             self._due.clear()
             frame = _NO_FIELD
             try:
                 if self._plays is not None:
-                    frame = await loop.run_in_executor(thread, self._drawn, *self._plays)
+                    frame = await in_thread(partial(self._drawn, *self._plays), name="field")
+                    self._problems.pop(_NOT_DRAWN, None)
             except Exception as error:
-                self._note("field of the plate: not drawn", error)
+                self._note(_NOT_DRAWN, error)
             self._frame = frame
             self._changed.set()
             self._changed = asyncio.Event()
@@ -162,9 +164,9 @@ class DrawnField:
         return self._solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
 
     def _note(self, failure: str, error: Exception) -> None:
-        """Log a problem, once while it lasts."""
+        """Log a failure with its reason, unless the same reason was logged and has not ended."""
         reason, _, _ = str(error).partition("\n")
-        problem = f"{failure}: {reason or type(error).__name__}"
-        if problem != self._problem:
-            self._problem = problem
-            _logger.warning("%s", problem)
+        reason = reason or type(error).__name__
+        if self._problems.get(failure) != reason:
+            self._problems[failure] = reason
+            _logger.warning("%s: %s", failure, reason)

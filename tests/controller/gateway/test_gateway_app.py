@@ -9,10 +9,11 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, MagicMock
 
 import httpx
 import numpy as np
@@ -21,7 +22,8 @@ from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 from prometheus_client.parser import text_string_to_metric_families
 
-from controller.api.link import Unreachable
+from controller.api.jsonrpc import event_line
+from controller.api.link import DaemonLink, Unreachable
 from controller.api.methods import (
     METHODS,
     ClearParams,
@@ -34,8 +36,10 @@ from controller.api.schema import PlayedTone
 from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.app import serve
+from controller.gateway.field import DrawnField
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
+from kit.plates import write_rig
 from model.arrays import ComplexArray
 from processes.daemons import ready_daemon, stated_readings
 from processes.gateways import (
@@ -494,3 +498,62 @@ def test_websocket_receives_the_field_of_the_drive(
     south_west, south_east, north_west = strength[0, 0], strength[0, -1], strength[-1, 0]
     assert south_west == strength.max()
     assert south_west > 2 * max(south_east, north_west)
+
+
+@contextlib.asynccontextmanager
+async def drawing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Callable[[str], Awaitable[bytes]]]:
+    """Yield a function that draws the playback of the ERA of a name, and returns its frame."""
+    rig_text = write_rig(tmp_path / "rig.yaml").read_text(encoding="utf-8")
+    lines: asyncio.Queue[bytes] = asyncio.Queue()
+    link = MagicMock(
+        hello=json.dumps({"result": {"rig_text": rig_text}}), send=AsyncMock(), next_line=lines.get
+    )
+    monkeypatch.setattr(DaemonLink, "open", AsyncMock(return_value=link))
+    field = DrawnField(tmp_path / "era.sock")
+    frames = field.frames()
+    await anext(frames)
+    tone = PlayedTone(frequency_hz=10.0, level=0.5, phase_deg=0.0)
+
+    async def draw(name: str) -> bytes:
+        event = pattern(**{"2": {name: tone}}).model_dump_json().encode()
+        lines.put_nowait(event_line("pattern", time=1.0, lost=0, data=event))
+        return await anext(frames)
+
+    running = asyncio.create_task(field.run())
+    try:
+        yield draw
+    finally:
+        running.cancel()
+        await asyncio.wait([running])
+
+
+async def test_drawing_error_is_logged_again_when_it_recurs_after_a_good_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An error is logged once while it lasts, and again once a good frame has ended it."""
+    logged = []
+    async with drawing(tmp_path, monkeypatch) as draw:
+        for name in ("UNKNOWN", "UNKNOWN", "SW", "UNKNOWN"):
+            await draw(name)
+            logged.append(caplog.text.count("field of the plate: not drawn"))
+    assert logged == [1, 1, 1, 2]
+
+
+async def test_drawing_does_not_delay_the_exit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python waits for threads that are not daemons: drawing starts none."""
+    started: list[threading.Thread] = []
+    start = threading.Thread.start
+
+    def record(thread: threading.Thread) -> None:
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", record)
+    async with drawing(tmp_path, monkeypatch) as draw:
+        await draw("SW")
+    assert started
+    assert all(thread.daemon for thread in started)

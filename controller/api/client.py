@@ -389,7 +389,12 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         return await self._repeated(attempt, again if METHODS[method].is_repeated else ())
 
     async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:
-        """Send a request over the current connection; raises RpcError and Unreachable."""
+        """Send a request over the current connection; raises RpcError and Unreachable.
+
+        A connection that was lost raises immediately, because nobody reads its responses any more.
+        """
+        if not link.is_open:
+            raise Unreachable.at(self.path, ConnectionResetError("closed by the daemon"))
         id = next(self._ids)
         pending = self._pending
         response = asyncio.get_running_loop().create_future()

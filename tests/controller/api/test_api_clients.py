@@ -311,6 +311,22 @@ def test_stop_is_sent_before_subscriptions_are_restored(tmp_path: Path) -> None:
     assert methods == ["hello", "subscribe", "hello", "stop"]
 
 
+def test_call_is_repeated_when_the_connection_is_lost_between_two_restored_topics(
+    tmp_path: Path,
+) -> None:
+    """The second topic is not sent on the lost connection, whose response would never arrive."""
+    accepted_then_lost = b'{"jsonrpc":"2.0","id":1,"result":{}}\n?\n'
+    with (
+        responding(tmp_path / "s", HELLO, accepted_then_lost) as received,
+        Client.connect(tmp_path / "s", timeout=2.0) as era,
+    ):
+        era.subscribe("state", "pattern")
+        with pytest.raises(ConnectionLost):
+            era.status()
+    methods = [json.loads(line)["method"] for line in received if line]
+    assert methods.count("hello") > 2
+
+
 @in_virtual_time
 async def test_stop_is_repeated_while_no_daemon_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

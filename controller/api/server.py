@@ -376,7 +376,7 @@ class ApiServer:
         return True
 
     def forget(self, client: Connection) -> None:
-        """Forget a client that has disconnected."""
+        """Forget a client that has disconnected; first carry out stops left in its input."""
         self._end_input(client)
         self.clients.pop(client, None)
         self._waiting.pop(client, None)

@@ -214,6 +214,7 @@ TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
         Action.DISARM,
         Action.VERIFY,
     ),
+    # `Supervisor.stop` queues the stop before this event, and does not carry out the action again.
     **_from(DaemonState, Trigger.STOP, None, Action.STOP),
     **_from((*_SILENT, *ENERGISED), Trigger.STOP, DaemonState.QUICK_STOP_ACTIVE, Action.STOP),
     **_from(

@@ -184,7 +184,10 @@ class Supervisor:
         return asyncio.shield(stopping)
 
     def stop_anyhow(self) -> Awaitable[object]:
-        """Stop all amplifiers, and latch that, if a client's stop request has failed on its way."""
+        """Stop all amplifiers, and latch that, if a client's stop request has failed on its way.
+
+        The failure may lie in `stop_all`, so this calls `group.stop` directly.
+        """
         cause = "stopped, though the request failed on its way"
         try:
             return asyncio.ensure_future(self.controller.group.stop())

@@ -499,7 +499,7 @@ class ApiServer:
         if not method.needs_reply:
             return handle
         if not call.expects_response:
-            return Empty
+            return _skip
         return partial(_handle_unless_withdrawn, client, client.silenced, handle)
 
     def _check(self, client: Connection, call: _Call) -> None:
@@ -541,6 +541,11 @@ class ApiServer:
             response = result_line(call.id, outcome.model_dump_json())
         if call.expects_response:
             client.respond(response)
+
+
+def _skip() -> ApiMessage:
+    """Do nothing for an arm without an id: its client would never receive the lease."""
+    return Empty()
 
 
 async def _handle_unless_withdrawn(

@@ -146,8 +146,6 @@ class SimulatedAmplifier:
         self._has_shown_limited = False
         self._watchdog = 0.0
         self._last_fed = 0.0
-        self.token = 0
-        """Token of the last set since arming that changed the playback; 0: none."""
         self.silent_from = -math.inf  # end of the last silencing ramp
         self._discharged_from = -math.inf  # of the last one while high voltage was on
         self.is_derated = False
@@ -412,7 +410,6 @@ class SimulatedAmplifier:
         # Arming starts at level zero, even if the last session left a fade.
         self.silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
-        self.token = 0
         self.session = values["session"]
         self.clock.shift(values["shift"])
         self.feed(now)
@@ -469,7 +466,6 @@ class SimulatedAmplifier:
         self.playback.commit(allowed_layers, token, now)
         if all(layer.renew for layer in layers):
             return
-        self.token = token
         self._is_limited |= any(
             exceeds_full(self.playback, channel, now) for channel in self._channels
         )

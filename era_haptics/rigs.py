@@ -1,7 +1,11 @@
 """Build rigs from rig-file keys, open amplifiers, convert drives to layers, and calibrate."""
 
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any
+from urllib.parse import quote
+from weakref import finalize
 
 from controller.play.routing import route
 from drivers.by_hand.actions import BlockingAmplifier
@@ -14,7 +18,7 @@ from model.estimate.measurement import measurement_of, read_measured
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig
-from model.rig.rig_writing import checked_keys
+from model.rig.rig_writing import checked_keys, save_rig
 from model.rig.sections import PlateSection
 
 
@@ -55,10 +59,10 @@ def open_amplifier(
 ) -> BlockingAmplifier:
     """Return an amplifier of the rig, open within a `with` block and disarmed after it.
 
-    name: optional if the rig has only one; url: replaces the rig's. Commands beyond the rig's
-    limits are rejected. Raises InputError for an unknown name. Entering the block raises
-    CommandError for an invalid URL, LinkError if there is no reply, and CommandRefused if the
-    amplifier rejects a request.
+    name: optional if the rig has only one; url: replaces the rig's; `sim://` simulates the
+    amplifier on a plate of its own. Commands beyond the rig's limits are rejected. Raises
+    InputError for an unknown name. Entering the block raises DriverError for an invalid URL,
+    LinkError if there is no reply, and CommandRefused if the amplifier rejects a request.
 
     Example:
         >>> url = "sim://examples/paper_plate.yaml"
@@ -73,8 +77,22 @@ def open_amplifier(
         raise InputError(f"name must be an amplifier of the rig, {', '.join(known)}, got {name!r}")
     if url is not None and not isinstance(url, str):
         raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
-    (found,) = chosen
-    return BlockingAmplifier(url or rig.amplifiers[found], limits=rig.limits)
+    (amplifier,) = chosen
+    url = url or rig.amplifiers[amplifier]
+    if url == "sim://":
+        return _simulated_amplifier(rig, amplifier)
+    return BlockingAmplifier(url, limits=rig.limits)
+
+
+def _simulated_amplifier(rig: Rig, name: str) -> BlockingAmplifier:
+    """Return an amplifier that is simulated from a copy of the rig, removed with it."""
+    folder = mkdtemp(prefix="era-haptics-rig-")
+    rig_file = Path(folder) / "rig.yaml"
+    save_rig(rig, rig_file)
+    url = f"sim://{quote(str(rig_file))}?amplifier={quote(name)}"
+    amplifier = BlockingAmplifier(url, limits=rig.limits)
+    finalize(amplifier, rmtree, folder, ignore_errors=True)
+    return amplifier
 
 
 def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...]]:

@@ -324,7 +324,7 @@ class BlockingAmplifier:
     def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         """Play only these layers from now on; returns them as rounded for the wire.
 
-        Raises CommandError if the amplifier's steps are too coarse: its only levels are zero and
+        Raises DriverError if the amplifier's steps are too coarse: its only levels are zero and
         full level, or a phase would be off by more than 5 degrees.
         """
         return self._wait(self._applied(layers))

@@ -2,9 +2,9 @@
 
     python follow.py 0.40,0.23 0.13,0.23      # metres from the south-west corner
 
-The last finger is the target. The daemon must be ready (`era status`). The client reconnects and
-resubscribes automatically. `armed` then renews its lease, and raises LeaseLost if the lease has
-expired.
+Each finger gets the effect that the layout has at its position. The daemon must be ready
+(`era status`). The client reconnects and resubscribes automatically. `armed` then renews its lease,
+and raises LeaseLost if the lease has expired.
 """
 
 import asyncio

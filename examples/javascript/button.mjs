@@ -1,4 +1,4 @@
-// Hold fingers on the plate for a second and say what they feel: the last one is the target.
+// Hold fingers on the plate for a second and print what they feel, which the layout decides.
 //
 //   node examples/javascript/button.mjs 0.22,0.16 0.08,0.06      # metres from the south-west corner
 //

@@ -357,6 +357,18 @@ def test_commands_for_follows_the_wiring() -> None:
     }
 
 
+def test_open_amplifier_simulates_a_rig_that_was_built_in_python() -> None:
+    """Its default amplifier `sim://` needs no file of the user's; it has a channel for each ERA."""
+    eras = {
+        name: era.Era(at=at, stiffness="17 kN/m")
+        for name, at in {"SW": (0, 0), "SE": (0.3, 0), "NE": (0.3, 0.2)}.items()
+    }
+    plate = era.Plate(length=0.3, width=0.2, thickness=0.0015, material="aluminium")
+    rig = era.rig(plate, eras)
+    with era.open_amplifier(rig) as amplifier:
+        assert amplifier.capabilities["channels"] == 3
+
+
 def test_open_amplifier_applies_the_limits_of_the_rig() -> None:
     """It plays within the limits and refuses commands beyond them."""
     rig = replace(RIG, limits=replace(RIG.limits, level=0.2))

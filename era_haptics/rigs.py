@@ -4,10 +4,10 @@ from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
 from typing import Any
-from urllib.parse import quote
 from weakref import finalize
 
 from controller.play.routing import route
+from controller.rig_file_check import whole_url
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing import AmplifierLayer
 from era_haptics.drive import Played, expect_rig, playable_layers
@@ -88,10 +88,9 @@ def _simulated_amplifier(rig: Rig, name: str) -> BlockingAmplifier:
     """Return an amplifier that is simulated from a copy of the rig, removed with it."""
     folder = mkdtemp(prefix="era-haptics-rig-")
     rig_file = Path(folder) / "rig.yaml"
-    save_rig(rig, rig_file)
-    url = f"sim://{quote(str(rig_file))}?amplifier={quote(name)}"
-    amplifier = BlockingAmplifier(url, limits=rig.limits)
+    amplifier = BlockingAmplifier(whole_url("sim://", rig_file, name), limits=rig.limits)
     finalize(amplifier, rmtree, folder, ignore_errors=True)
+    save_rig(rig, rig_file)
     return amplifier
 
 

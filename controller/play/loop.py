@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import ParamSpec
 
-from controller.play.planner import Plan, Planner
+from controller.play.planner import Plan, Planner, PlanKind
 from controller.play.reports import Observers, play_report
 from controller.play.slots import RELEASE_RAMP
 from controller.sources.contact_tracker import ContactTracker
@@ -145,7 +145,7 @@ class Cycle:
             self._plan = None
         if plan.sets.reason:
             _report(self.observers.refused, plan.sets.reason)
-        if not plan.is_reported:
+        if plan.kind is not PlanKind.CHANGE:
             return
         sent_at = outcome if isinstance(outcome, float) else None
         report = play_report(plan, planner.slots.by_layer, sent_at=sent_at, now=threads.now())

@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum, auto
 from functools import partial
 
 from controller.play.changes import ChangeTimes, WaitingChanges
@@ -39,6 +40,17 @@ _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; longest time without counting clocks whil
 _logger = logging.getLogger(__name__)
 
 
+class PlanKind(Enum):
+    """The effect of a plan's sets on the contents that play."""
+
+    CHANGE = auto()
+    """Contents start, change or end; observers get a report."""
+    ENDS = auto()
+    """Contents end; the contents that the plan was to start wait for the next plan."""
+    PROLONGATION = auto()
+    """The same contents continue: renewals, endings, pieces of courses."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """The contents that play from a moment on, and the sets that start them."""
@@ -51,8 +63,7 @@ class Plan:
     """Changes of fingers that the plan responds to."""
     sets: Sets = field(default_factory=Sets)
     """Empty if no layer changes."""
-    is_reported: bool = True
-    """Whether observers get a report, because a finger feels a difference."""
+    kind: PlanKind = PlanKind.CHANGE
     former_slots: Mapping[int, Slot] = field(default_factory=dict)
     """Slots before the plan, by layer."""
 
@@ -251,7 +262,9 @@ class Planner:
             )
             return self._last_plan
         renewal = self.slots.renewal(now)
-        return replace(plan, sets=renewal, is_reported=False) if renewal else None
+        if not renewal:
+            return None
+        return replace(plan, sets=renewal, kind=PlanKind.PROLONGATION)
 
     def _playable(self, selection: Selection) -> Selection:
         """Return a selection without contents that have ended by themselves or have no layer."""
@@ -303,9 +316,10 @@ class Planner:
         The known playback is discarded. If is_known, the former contents still play, except that
         layers ended by the plan may be silent or not; the next plan ends these again.
         """
-        if plan.is_reported or not is_known:
+        is_change = plan.kind is PlanKind.CHANGE
+        if is_change or not is_known:
             self.forget()
-        if not plan.is_reported:
+        if not is_change:
             return
         self._tracker.wait_again(plan.answered)
         self.slots.by_layer = {}
@@ -317,7 +331,7 @@ class Planner:
 
     def only_ends(self, plan: Plan) -> Plan:
         """Return a plan that starts and prolongs nothing; contents to be started wait again."""
-        if not plan.is_reported:
+        if plan.kind is PlanKind.PROLONGATION:
             return replace(plan, sets=Sets())
         started = plan.sets.started
         if not started:
@@ -326,7 +340,7 @@ class Planner:
         endings = {
             number: layer for number, layer in plan.sets.layers.items() if number not in started
         }
-        return replace(plan, sets=Sets(endings), is_reported=False)
+        return replace(plan, sets=Sets(endings), kind=PlanKind.ENDS)
 
     def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
         """Note how the amplifiers play sets, which were committed before now [s].
@@ -343,11 +357,13 @@ class Planner:
         self.slots.confirm(sets, played, now)
 
     def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
-        """Return silence in place of a plan that amplifiers refused although the ledgers admit it.
+        """Return a plan in place of one that amplifiers refused although the ledgers admit it.
 
-        The contents are planned again when the refusal ends, or after RETRY if that is unknown.
+        A refused prolongation sends nothing, and its contents end. Any other refused plan becomes
+        silence, and its contents are planned again when the refusal ends, or after RETRY if that is
+        unknown.
         """
-        if not plan.is_reported and self.slots.by_layer:
+        if plan.kind is PlanKind.PROLONGATION:
             self.slots.not_renewed(plan.sets, refusal)
             return replace(plan, sets=Sets())
         is_by_limit = refusal.until is None or refusal.until > now
@@ -357,7 +373,8 @@ class Planner:
         self._retry_at = max(retry_at, now + HEARTBEAT)
         self._changes.refused = plan.answered
         silence = self.slots.silence(FADE_RAMP, now)
-        return replace(plan, sets=replace(silence, reason=str(refusal)), is_reported=True)
+        sets = replace(silence, reason=str(refusal))
+        return replace(plan, sets=sets, kind=PlanKind.CHANGE)
 
     def prepare(self) -> None:
         """Compute in advance everything the first touch would wait for; seconds for a large rig.

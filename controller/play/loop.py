@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import ParamSpec
 
-from controller.play.planner import Plan, Planner, PlanKind
+from controller.play.planner import Plan, PlanKind, Planner
 from controller.play.reports import Observers, play_report
 from controller.play.slots import RELEASE_RAMP
 from controller.sources.contact_tracker import ContactTracker

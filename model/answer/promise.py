@@ -34,13 +34,9 @@ from model.arrays import (
 from model.drive_modes import Forms, WeightedTones
 from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import PROMISED_DRAWS, Drawing, over_fingertips, percentile
-from model.ensemble.touched_plate import (
-    FingertipAmplitudes,
-    LoadedContacts,
-    TouchedPlate,
-    outer,
-    touch,
-)
+from model.ensemble.expected_power import outer
+from model.ensemble.kernel_plates import touch
+from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate
 from model.finger import decibels, detection_threshold
 from model.structure.attachments import fingertip_loads
 from model.table.table import FingertipShapes, LocalizationTable, read_fingertips

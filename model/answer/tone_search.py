@@ -72,7 +72,8 @@ from model.drive_modes import (
     search_to_level,
 )
 from model.ensemble.draws import JUDGING_DRAWS, PERCENTILE, PROMISED_DRAWS, percentile
-from model.ensemble.touched_plate import RIDGE, draws_structure, plates_structure
+from model.ensemble.expected_power import RIDGE
+from model.ensemble.kernel_plates import draws_structure, plates_structure
 from model.finger import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable, given_raster
 

@@ -1,4 +1,4 @@
-"""Fingers on plates with eliminated ERAs, and felt vibration on drawn plates, in numpy and in C.
+"""Fingers on a plate on its ERAs, and the vibration that they feel on drawn plates, in numpy.
 
 k fingers of dynamic stiffness D at centres c change fields X of a plate on its ERAs to
 
@@ -19,29 +19,16 @@ under a finger. The thickness counts by half the sum of dh* dh^T of the plates t
 by one standard deviation, solved exactly; the modulus is included there (`attached_plate`). The
 effect of the loss factor is negligible.
 
-`TouchedPlate` is in numpy, `TouchedByKernel` the same in C; `touch` uses the faster one available.
+`model.ensemble.kernel_plates` has the same computation in C, and puts fingers on a plate with the
+faster one available.
 """
 
-import ctypes
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from weakref import WeakKeyDictionary
+from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.compiled.kernels import (
-    Kernels,
-    PlateDraws,
-    PointGroups,
-    Sensors,
-    TouchedPlates,
-    as_given,
-    kernels,
-    run_kernel,
-)
+from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.attached_plate import MODELLED, THICKER, THINNER, PlateOnEras
 from model.ensemble.draws import (
     EXACT_CLOCKS,
@@ -52,13 +39,7 @@ from model.ensemble.draws import (
     draw,
     over_fingertips,
 )
-
-RIDGE = 1e-6
-"""Share of a form's mean diagonal that is added to it, which keeps it definite."""
-
-_MAX_LANES = 16
-_OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
-_OF_ROWS = ("minus_omega2", "forces", "strokes", "by_damping", "by_stiffness", "shapes")
+from model.ensemble.expected_power import expected_power, gram, power_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +84,77 @@ class FingertipAmplitudes:
     """Squared amplitude at all points (m, k p, 1 + d), None unless wanted."""
 
 
+@dataclass(frozen=True)
+class DrawnPlates:
+    """Plates drawn for a number of fingers; a single thickness if the thickness is certain."""
+
+    draws: Draws
+    thickness_count: int
+    """Number of thicknesses of the draws."""
+    first_thickness: int
+    """Index of the first of them."""
+    base_count: int
+    """Number of thicknesses at which changes are computed."""
+    first_base: int
+    """Index of the first of these."""
+
+    @classmethod
+    def of(cls, plate_on_eras: PlateOnEras, finger_count: int, drawing: Drawing) -> "DrawnPlates":
+        """Draw plates with a number of fingers."""
+        plate = plate_on_eras.plate
+        uncertainty = plate.uncertainty
+        first_thickness = plate_on_eras.first.get(drawing.thicknesses, MODELLED)
+        thickness_count = drawing.thicknesses if first_thickness else 1
+        first_base = plate_on_eras.first.get(drawing.bases, MODELLED)
+        base_count = drawing.bases if first_base else 1
+        draws = draw(
+            plate.era_count,
+            finger_count,
+            masses=plate.stiffness.shape[1] - plate.era_count,
+            to_feet=plate.by_stiffness.shape[1] - plate.era_count,
+            count=drawing.count,
+            seed=drawing.seed,
+            gain=uncertainty.gain,
+            phase=math.radians(uncertainty.phase_deg),
+            common_gain=uncertainty.common_gain,
+            harmonic=uncertainty.harmonic,
+            thicknesses=thickness_count,
+        )
+        return cls(draws, thickness_count, first_thickness, base_count, first_base)
+
+    def bases_of(self, tone_count: int) -> IntArray:
+        """Indices of the thicknesses at which changes are computed, for tones one after another."""
+        return self.first_base + np.tile(np.arange(self.base_count), tone_count)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fingers:
+    """k fingers that hold the plate in c cases."""
+
+    stiffness: Complex64Array
+    """D (c, k) [N/m]."""
+    response: Complex64Array
+    """T at the fingers' centres (c, k, b), without the fingers."""
+    displacement: Complex64Array
+    """G (c, k, r)."""
+    share: Complex64Array
+    """P (c, k, k)."""
+
+    def under_fingers(self, free: Complex64Array) -> Complex64Array:
+        """Fields (c, k, q) at the fingers, from those without fingers."""
+        return np.asarray(self.share @ free)
+
+    def coordinates(self, free: Complex64Array, under_fingers: Complex64Array) -> Complex64Array:
+        """Coordinates (c, q, r) with the fingers, from those without and the fields at fingers."""
+        finger_forces = self.stiffness[:, :, None] * under_fingers
+        return np.asarray(free - finger_forces.swapaxes(1, 2) @ self.displacement)
+
+
 @dataclass(frozen=True, eq=False)
 class TouchedPlate:
     """A plate of every thickness with k fingers on it."""
 
-    on: PlateOnEras
+    plate_on_eras: PlateOnEras
     centres: Float32Array
     """Mode shapes (k, r) at the fingers."""
     stiffness: Complex64Array
@@ -126,33 +173,39 @@ class TouchedPlate:
         each finger, (c, p, b + k); displacement of attachments and fingers for each ERA at full
         stroke [m], (c, b + k, n).
         """
-        on, plate, n = self.on, self.on.plate, self.on.plate.era_count
-        w2 = plate.minus_omega2[rows, None, None]
-        at, G, P = self._fingers(rows, nodes)
-        coordinates, resting = self._with_fingers(rows, on.by_force[rows, nodes], at, G, P)
-        coordinates = np.concatenate([coordinates, w2 * (P @ G)], axis=1)
-        fingers = resting[:, :, :n] * plate.forces[rows, None] / w2
-        held = at.swapaxes(1, 2) @ (self.stiffness[rows, :, None] * fingers) / w2
-        moved = np.concatenate([on.moved[rows, nodes] - held, fingers], axis=1)
-        return points @ coordinates.swapaxes(1, 2), moved
+        plate = self.plate_on_eras.plate
+        minus_omega2 = plate.minus_omega2[rows, None, None]
+        fingers = self._fingers(rows, nodes)
+        free = self.plate_on_eras.by_force[rows, nodes]
+        under_fingers = fingers.under_fingers(fingers.response)
+        by_attachment = fingers.coordinates(free, under_fingers)
+        by_finger = minus_omega2 * (fingers.share @ fingers.displacement)
+        coordinates = np.concatenate([by_attachment, by_finger], axis=1)
+        responses = points @ coordinates.swapaxes(1, 2)
+
+        by_era = under_fingers[:, :, : plate.era_count]
+        finger_motion = by_era * plate.forces[rows, None] / minus_omega2
+        finger_forces = fingers.stiffness[:, :, None] * finger_motion
+        prevented = fingers.response.swapaxes(1, 2) @ finger_forces / minus_omega2
+        attachment_motion = self.plate_on_eras.moved[rows, nodes] - prevented
+        return responses, np.concatenate([attachment_motion, finger_motion], axis=1)
 
     def fields(
         self, rows: IntArray, nodes: IntArray, weights: Complex64Array, points: Float32Array
     ) -> Complex64Array:
         """Accelerations (c, p) at points of shapes (p, r) by weights (c, n) of the ERAs."""
-        forces = self.on.plate.forces[rows] * weights
-        by_force = self.on.by_force[rows, nodes, : forces.shape[1]]
-        driven = np.asarray(forces[:, None] @ by_force, dtype=np.complex64)
-        _, G, P = self._fingers(rows, nodes)
-        found, _ = self._with_fingers(rows, driven, self.centres @ driven.swapaxes(1, 2), G, P)
-        return (points @ found.swapaxes(1, 2))[:, :, 0]
+        forces = self.plate_on_eras.plate.forces[rows] * weights
+        era_count = forces.shape[1]
+        by_era = self.plate_on_eras.by_force[rows, nodes, :era_count]
+        free = np.asarray(forces[:, None] @ by_era, dtype=np.complex64)
+        coordinates = self._held(rows, nodes, free)
+        return (points @ coordinates.swapaxes(1, 2))[:, :, 0]
 
     def coordinates(self) -> Complex64Array:
         """Reduced coordinates by each ERA at full stroke at all frequencies, (f, n, r)."""
-        driven, rows = self.on.fields, np.arange(len(self.stiffness))
-        _, G, P = self._fingers(rows, np.full(len(rows), MODELLED))
-        found, _ = self._with_fingers(rows, driven, self.centres @ driven.swapaxes(1, 2), G, P)
-        return found
+        rows = np.arange(len(self.stiffness))
+        nodes = np.full(len(rows), MODELLED)
+        return self._held(rows, nodes, self.plate_on_eras.fields)
 
     def forms(
         self,
@@ -168,72 +221,124 @@ class TouchedPlate:
         weights (g, p): of a group's points, sum 1; error_power (all, n): mean square of the
         discretisation error of each ERA's field at all frequencies of the plate.
         """
-        plate, n, f, (g, p, r) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
-        forces, every = plate.forces[rows, None], points.reshape(-1, r)
-        modelled = np.full(f, MODELLED)
-        by_force, moved = self.sources(rows, modelled, every)
-        h = by_force[:, :, :n] * forces
-        stretched = -moved
-        stretched.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes[rows]
-        changes = [h, by_force[:, :, :n] @ (plate.by_damping[rows, :, None] * stretched[:, :n])]
+        plate = self.plate_on_eras.plate
+        modelled = np.full(len(rows), MODELLED)
+        by_group = (len(rows), *weights.shape, -1)
+        all_points = points.reshape(-1, points.shape[2])
+        responses, motion = self.sources(rows, modelled, all_points)
+        deformation = self._deformation(rows, motion)
+        fields = self._era_fields(rows, responses)
+        changes = [self._changes_by_damping(rows, responses, deformation)]
         if plate.uncertainty.changes_modes:
-            for node in (THICKER, THINNER):
-                other, _ = self.sources(rows, np.full(f, node), every)
-                changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
-        a, k, s = moved.shape[1], len(self.centres), plate.by_stiffness.shape[1]
-        uncertain = np.concatenate([np.arange(s), np.arange(a - k, a)])
-        load = self.load_std * self.stiffness[rows]
-        by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
-        deformed = stretched[:, uncertain] * by_one[:, :, None]
-        reach = power_of(by_force[:, :, uncertain]).reshape(f, g, p, -1)
-        own = np.sqrt(weights[:, None] @ reach).swapaxes(2, 3) * deformed[:, None]
-        found, *changed = (each.reshape(f, g, p, n) for each in changes)
+            changes += self._changes_by_thickness(rows, all_points, fields)
+
+        group_fields = fields.reshape(by_group)
         power = expected_power(
-            [found, *changed],
-            own,
+            [group_fields, *(change.reshape(by_group) for change in changes)],
+            self._rms_changes_by_stiffness(rows, responses, deformation, weights),
             weights,
             gain_variance=plate.uncertainty.gain_variance,
             error_power=error_power[rows, None],
             shares=self.clocks.power_shares(plate.frequencies[rows]),
         )
-        uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
-        if fine is None:
-            return LoadedContacts(found, None, power, uncertain)
-        by_fine, _ = self.sources(rows, modelled, fine.reshape(-1, r))
-        at_fine = (by_fine[:, :, :n] * forces).reshape(f, g, -1, n)
-        return LoadedContacts(found, at_fine, power, uncertain)
+        certain = gram(group_fields * np.sqrt(weights)[:, :, None])
+        fine_fields = None
+        if fine is not None:
+            fine_responses, _ = self.sources(rows, modelled, fine.reshape(-1, fine.shape[2]))
+            by_fine_group = (len(rows), *fine.shape[:2], -1)
+            fine_fields = self._era_fields(rows, fine_responses).reshape(by_fine_group)
+        return LoadedContacts(group_fields, fine_fields, power, power - certain)
+
+    def _era_fields(self, rows: IntArray, responses: Complex64Array) -> Complex64Array:
+        """Fields (f, p, n) of ERAs at full stroke, from responses to forces."""
+        plate = self.plate_on_eras.plate
+        return responses[:, :, : plate.era_count] * plate.forces[rows, None]
+
+    def _deformation(self, rows: IntArray, motion: Complex64Array) -> Complex64Array:
+        """Deformation (f, b + k, n) of attachments and fingers by each ERA at full stroke [m]."""
+        plate = self.plate_on_eras.plate
+        eras = np.arange(plate.era_count)
+        deformation = -motion
+        deformation[:, eras, eras] += plate.strokes[rows]
+        return deformation
+
+    def _changes_by_damping(
+        self, rows: IntArray, responses: Complex64Array, deformation: Complex64Array
+    ) -> Complex64Array:
+        """Change (f, p, n) of the fields per standard deviation of all ERAs' damping."""
+        plate = self.plate_on_eras.plate
+        era_count = plate.era_count
+        forces = plate.by_damping[rows, :, None] * deformation[:, :era_count]
+        return responses[:, :, :era_count] @ forces
+
+    def _changes_by_thickness(
+        self, rows: IntArray, points: Float32Array, fields: Complex64Array
+    ) -> list[Complex64Array]:
+        """Changes (f, p, n) of the fields on the thicker and the thinner plate, by sqrt(1/2)."""
+        changes = list[Complex64Array]()
+        for node in (THICKER, THINNER):
+            responses, _ = self.sources(rows, np.full(len(rows), node), points)
+            difference = self._era_fields(rows, responses) - fields
+            changes.append(difference * np.float32(math.sqrt(0.5)))
+        return changes
+
+    def _rms_changes_by_stiffness(
+        self,
+        rows: IntArray,
+        responses: Complex64Array,
+        deformation: Complex64Array,
+        weights: Float32Array,
+    ) -> Complex64Array:
+        """RMS change (f, g, j, n) over groups of points by each ERA's and foot's stiffness and each
+        finger's load, per standard deviation."""
+        by_stiffness = self.plate_on_eras.plate.by_stiffness[rows]
+        by_load = self.load_std * self.stiffness[rows]
+        change_of_stiffness = np.concatenate([by_stiffness, by_load], axis=1)
+        attachment_count = deformation.shape[1]
+        fingers = np.arange(attachment_count - len(self.centres), attachment_count)
+        uncertain = np.concatenate([np.arange(by_stiffness.shape[1]), fingers])
+        forces = deformation[:, uncertain] * change_of_stiffness[:, :, None]
+        response_power = power_of(responses[:, :, uncertain])
+        by_group = response_power.reshape(len(rows), *weights.shape, -1)
+        rms_responses = np.sqrt(weights[:, None] @ by_group).swapaxes(2, 3)
+        return np.asarray(rms_responses * forces[:, None])
 
     def changes(
         self,
         rows: IntArray,
         nodes: IntArray,
         weights: Complex64Array,
-        moved: Complex64Array,
+        motion: Complex64Array,
         points: Float32Array,
     ) -> Changes:
         """Compute changes of forces, for weights (c, n) and the resulting motion (c, b + k) [m]."""
-        plate, n = self.on.plate, weights.shape[1]
+        plate = self.plate_on_eras.plate
+        era_count = plate.era_count
+        mount_count = plate.stiffness.shape[1]
+        uncertain_count = plate.by_stiffness.shape[1]
+        drives = np.zeros_like(motion)
+        drives[:, :era_count] = plate.forces[rows] * weights
+        deformation = -motion
+        deformation[:, :era_count] += plate.strokes[rows] * weights
+        damping = np.zeros_like(motion)
+        damping[:, :era_count] = plate.by_damping[rows] * deformation[:, :era_count]
+        own = np.zeros_like(motion)
+        own[:, :uncertain_count] = plate.by_stiffness[rows] * deformation[:, :uncertain_count]
+        by_load = self.load_std * self.stiffness[rows]
+        own[:, mount_count:] = by_load * deformation[:, mount_count:]
+
         shapes = np.concatenate([plate.shapes, self.centres])
         stiffness = np.concatenate([plate.stiffness[rows], self.stiffness[rows]], axis=1)
-        damping, own, drives = (np.zeros_like(moved) for _ in range(3))
-        drives[:, :n] = plate.forces[rows] * weights
-        stretched = -moved
-        stretched[:, :n] += plate.strokes[rows] * weights
-        damping[:, :n] = plate.by_damping[rows] * stretched[:, :n]
-        b, s = plate.stiffness.shape[1], plate.by_stiffness.shape[1]
-        own[:, :s] = plate.by_stiffness[rows] * stretched[:, :s]
-        by_load = self.load_std * self.stiffness[rows]
-        own[:, b:] = by_load * stretched[:, b:]
-        held = np.asarray(drives - stiffness * moved, dtype=np.complex64)
-        by_loss = self.on.by_loss[rows, nodes]
-        lost = np.asarray(by_loss * (held @ shapes), dtype=np.complex64)
-        at_points = plate.minus_omega2[rows, None] * (lost @ points.T)
-        loss = -stiffness * (lost @ shapes.T)
+        forces = np.asarray(drives - stiffness * motion, dtype=np.complex64)
+        by_loss = self.plate_on_eras.by_loss[rows, nodes]
+        coordinates = np.asarray(by_loss * (forces @ shapes), dtype=np.complex64)
+        at_points = plate.minus_omega2[rows, None] * (coordinates @ points.T)
+        loss = -stiffness * (coordinates @ shapes.T)
         return Changes(loss, damping, own, drives, at_points)
 
     def drawn(
         self,
-        by: Drawing,
+        drawing: Drawing,
         rows: IntArray,
         weights: Complex64Array,
         points: Float32Array,
@@ -249,46 +354,79 @@ class TouchedPlate:
         mean over a fingertip. At all frequencies of the plate: error_power (f, n), mean square of
         the discretisation error of each ERA's field; threshold (f,) [m/s²].
         """
-        m, (k, p), d, clocks = len(rows), shares.shape, by.count, self.clocks
-        draws, nodes, (t, first_base), first = drawn_on(self.on, k, by)
-        cases = np.array([MODELLED, *range(first, first + nodes)])
-        at_nodes = self.fields(
-            rows.repeat(1 + nodes), np.tile(cases, m), weights.repeat(1 + nodes, axis=0), points
-        ).reshape(m, 1 + nodes, -1)
-        bases = first_base + np.tile(np.arange(t), m)
-        at, of_base = rows.repeat(t), weights.repeat(t, axis=0)
-        gains = draws.gains
-        if clocks.errors:
-            gains = delayed(gains, clocks, by, self.on.plate.omega[at])
-        by_force, moved = self.sources(at, bases, points)
-        changes = self.changes(at, bases, of_base, np.matvec(moved, of_base), points)
-        parts = [
-            each[:, :, None] * numbers
-            for each, numbers in (
-                (changes.loss, draws.loss),
-                (changes.damping, draws.damping),
-                (changes.own, draws.own),
-                (changes.drives, gains),
-            )
-        ]
-        forces = np.add.reduce(parts).reshape(m, t, -1, t, d // t)
-        by_loss = changes.by_loss.reshape(m, t, -1, 1) * draws.loss.reshape(t, 1, -1)
-        own = np.arange(t)
-        by_force = by_force.reshape(m, t, *by_force.shape[1:])
-        changed = by_force @ forces[:, own, :, own].swapaxes(0, 1) + by_loss
-        found = at_nodes[:, 1 + draws.node].swapaxes(1, 2)
-        found = found + changed.swapaxes(1, 2).reshape(m, k * p, d)
+        plates = DrawnPlates.of(self.plate_on_eras, len(shares), drawing)
+        draws = plates.draws
+        by_thickness = self._fields_by_thickness(plates, rows, weights, points)
+        nominal = by_thickness[:, 0, :, None]
+        fields = by_thickness[:, 1 + draws.node].swapaxes(1, 2)
+        fields = fields + self._drawn_changes(plates, drawing, rows, weights, points)
         error = np.sqrt((error_power[rows] * power_of(weights)).sum(axis=1))
-        found.reshape(m, k, p, d)[:] += (error[:, None, None] * draws.errors)[:, :, None]
-        every = np.concatenate([at_nodes[:, 0, :, None], found], axis=2)
-        powers = power_of(every) / (threshold[rows] ** 2)[:, None, None]
-        return FingertipAmplitudes(
-            *over_fingertips(powers, shares), powers if with_powers else None
+        finger_errors = error[:, None, None] * draws.errors
+        point_count = shares.shape[1]
+        fields += finger_errors.repeat(point_count, axis=1)
+
+        squared_threshold = (threshold[rows] ** 2)[:, None, None]
+        powers = power_of(np.concatenate([nominal, fields], axis=2)) / squared_threshold
+        means, loudest = over_fingertips(powers, shares)
+        return FingertipAmplitudes(means, loudest, powers if with_powers else None)
+
+    def _fields_by_thickness(
+        self, plates: DrawnPlates, rows: IntArray, weights: Complex64Array, points: Float32Array
+    ) -> Complex64Array:
+        """Fields (m, 1 + thicknesses, p) of tones on the nominal plate and at all thicknesses."""
+        first = plates.first_thickness
+        nodes = np.array([MODELLED, *range(first, first + plates.thickness_count)])
+        fields = self.fields(
+            rows.repeat(len(nodes)),
+            np.tile(nodes, len(rows)),
+            weights.repeat(len(nodes), axis=0),
+            points,
         )
+        return fields.reshape(len(rows), len(nodes), -1)
+
+    def _drawn_changes(
+        self,
+        plates: DrawnPlates,
+        drawing: Drawing,
+        rows: IntArray,
+        weights: Complex64Array,
+        points: Float32Array,
+    ) -> Complex64Array:
+        """Changes (m, p, d) of tones' fields by all parameters but the thickness."""
+        draws = plates.draws
+        tone_count = len(rows)
+        base_count = plates.base_count
+        nodes = plates.bases_of(tone_count)
+        base_rows = rows.repeat(base_count)
+        base_weights = weights.repeat(base_count, axis=0)
+        responses, era_motion = self.sources(base_rows, nodes, points)
+        motion = np.matvec(era_motion, base_weights)
+        changes = self.changes(base_rows, nodes, base_weights, motion, points)
+        gains = draws.gains
+        if self.clocks.errors:
+            omega = self.plate_on_eras.plate.omega[base_rows]
+            gains = delayed(gains, self.clocks, drawing, omega)
+        force_terms = [
+            changes.loss[:, :, None] * draws.loss,
+            changes.damping[:, :, None] * draws.damping,
+            changes.own[:, :, None] * draws.own,
+            changes.drives[:, :, None] * gains,
+        ]
+        # Every plate is computed with the changes of its own base.
+        by_base = (tone_count, base_count, -1, base_count, drawing.count // base_count)
+        forces = np.add.reduce(force_terms).reshape(by_base)
+        base = np.arange(base_count)
+        own_forces = forces[:, base, :, base].swapaxes(0, 1)
+        base_responses = responses.reshape(tone_count, base_count, *responses.shape[1:])
+        field_by_loss = changes.by_loss.reshape(tone_count, base_count, -1, 1)
+        by_loss = field_by_loss * draws.loss.reshape(base_count, 1, -1)
+        fields = base_responses @ own_forces + by_loss
+        by_tone = fields.swapaxes(1, 2).reshape(tone_count, len(points), drawing.count)
+        return np.asarray(by_tone)
 
     def harmonics(
         self,
-        by: Drawing,
+        drawing: Drawing,
         rows: IntArray,
         weights: Complex64Array,
         points: Float32Array,
@@ -299,284 +437,37 @@ class TouchedPlate:
         For a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; other
         arguments: see `drawn`. The nominal plate has none.
         """
-        (k, p), d, n = shares.shape, by.count, self.on.plate.era_count
-        draws, _, (t, first_base), _ = drawn_on(self.on, k, by)
-        at, bases = rows.repeat(t), first_base + np.tile(np.arange(t), len(rows))
-        by_force, _ = self.sources(at, bases, points.reshape(k * p, -1))
-        driven = self.on.plate.forces[at] * weights.repeat(t, axis=0)
-        fields = (by_force[:, :, :n] * driven[:, None]).reshape(len(rows), t, k * p, n)
-        drawn = fields @ draws.harmonics.reshape(n, t, d // t).swapaxes(0, 1)
-        power = power_of(drawn).swapaxes(1, 2).reshape(len(rows), k, p, d)
-        found = (shares[:, None] @ power)[:, :, 0]
-        return np.asarray(np.pad(found, ((0, 0), (0, 0), (1, 0))), dtype=np.float32)
+        plate = self.plate_on_eras.plate
+        plates = DrawnPlates.of(self.plate_on_eras, len(shares), drawing)
+        base_count = plates.base_count
+        base_rows = rows.repeat(base_count)
+        all_points = points.reshape(-1, points.shape[2])
+        responses, _ = self.sources(base_rows, plates.bases_of(len(rows)), all_points)
+        forces = plate.forces[base_rows] * weights.repeat(base_count, axis=0)
+        fields = responses[:, :, : plate.era_count] * forces[:, None]
+        base_fields = fields.reshape(len(rows), base_count, len(all_points), -1)
+        by_base = (plate.era_count, base_count, drawing.count // base_count)
+        harmonic_motion = plates.draws.harmonics.reshape(by_base).swapaxes(0, 1)
+        power = power_of(base_fields @ harmonic_motion).swapaxes(1, 2)
+        by_finger = power.reshape(len(rows), *shares.shape, drawing.count)
+        means = (shares[:, None] @ by_finger)[:, :, 0]
+        return np.asarray(np.pad(means, ((0, 0), (0, 0), (1, 0))), dtype=np.float32)
 
-    def _fingers(
-        self, rows: IntArray, nodes: IntArray
-    ) -> tuple[Complex64Array, Complex64Array, Complex64Array]:
-        """Return T at the centres (c, k, b), G (c, k, r) and P (c, k, k)."""
-        on, by_force = self.on, self.on.by_force[rows, nodes]
-        at = self.centres @ by_force.swapaxes(1, 2)
-        free = on.receptance[rows, nodes][:, None] * self.centres
-        G = np.asarray(free + (at @ on.coupling[rows, nodes]) @ by_force, dtype=np.complex64)
-        system = (self.centres @ G.swapaxes(1, 2)) * self.stiffness[rows, None]
-        k = len(self.centres)
-        system.reshape(len(rows), -1)[:, :: k + 1] += 1
-        return at, G, np.asarray(np.linalg.inv(system))
+    def _fingers(self, rows: IntArray, nodes: IntArray) -> _Fingers:
+        """Return how the fingers hold the plate in cases of rows (c,) and nodes (c,)."""
+        by_force = self.plate_on_eras.by_force[rows, nodes]
+        response = self.centres @ by_force.swapaxes(1, 2)
+        free = self.plate_on_eras.receptance[rows, nodes][:, None] * self.centres
+        coupled = (response @ self.plate_on_eras.coupling[rows, nodes]) @ by_force
+        displacement = np.asarray(free + coupled, dtype=np.complex64)
+        stiffness = self.stiffness[rows]
+        system = (self.centres @ displacement.swapaxes(1, 2)) * stiffness[:, None]
+        fingers = np.arange(len(self.centres))
+        system[:, fingers, fingers] += 1
+        return _Fingers(stiffness, response, displacement, np.asarray(np.linalg.inv(system)))
 
-    def _with_fingers(
-        self,
-        rows: IntArray,
-        free: Complex64Array,
-        at: Complex64Array,
-        G: Complex64Array,
-        P: Complex64Array,
-    ) -> tuple[Complex64Array, Complex64Array]:
-        """Return coordinates (c, q, r) with the fingers, and the field (c, k, q) at these.
-
-        free (c, q, r): coordinates without fingers; at (c, k, q): their field at the fingers.
-        """
-        resting = np.asarray(P @ at)
-        held = self.stiffness[rows, :, None] * resting
-        return np.asarray(free - held.swapaxes(1, 2) @ G), resting
-
-
-@dataclass(frozen=True, eq=False)
-class TouchedByKernel(TouchedPlate):
-    """A plate with fingers, computed by kernels in C."""
-
-    kernels: Kernels = field(kw_only=True)
-
-    @cached_property
-    def structure(self) -> TouchedPlates:
-        """The plate as kernels read it."""
-        found = TouchedPlates.from_buffer_copy(plates_structure(self.on))
-        found.k = len(self.centres)
-        found.point(centres=self.centres, stiffness=self.stiffness, load_std=self.load_std)
-        return found
-
-    def forms(
-        self,
-        rows: IntArray,
-        points: Float32Array,
-        weights: Float32Array,
-        error_power: Float32Array,
-        fine: Float32Array | None = None,
-    ) -> LoadedContacts:
-        """As `TouchedPlate.forms`."""
-        plate, n, f, (g, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
-        fine_count = 0 if fine is None else fine.shape[1]
-        of = PointGroups(
-            groups=g,
-            p=p,
-            fine=g * fine_count,
-            others=plate.uncertainty.changes_modes,
-            gain_variance=plate.uncertainty.gain_variance,
-            ridge=RIDGE,
-        )
-        of.point(
-            points=points,
-            fine_points=fine,
-            weights=weights,
-            error=error_power,
-            shares=self.clocks.power_shares(plate.frequencies),
-        )
-        sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
-        found = [np.empty(size, dtype=np.complex64) for size in sizes]
-        to, at = (ctypes.c_void_p * 4)(*(each.ctypes.data for each in found)), as_given(rows)
-        run_kernel(self.kernels.library.forms_stage, self.structure, of, at.ctypes, f, to)
-        return LoadedContacts(found[0], None if fine is None else found[1], found[2], found[3])
-
-    def drawn(
-        self,
-        by: Drawing,
-        rows: IntArray,
-        weights: Complex64Array,
-        points: Float32Array,
-        shares: Float32Array,
-        error_power: Float32Array,
-        threshold: Float32Array,
-        *,
-        with_powers: bool = False,
-    ) -> FingertipAmplitudes:
-        """As `TouchedPlate.drawn`."""
-        m, (k, p) = len(rows), shares.shape
-        at = Sensors(k * p)
-        at.point(rows=points, weights=shares, error=error_power, threshold=threshold)
-        powers = np.empty((m, k * p, 1 + by.count) if with_powers else 0, dtype=np.float32)
-        means, loudest = (np.empty((m, k, 1 + by.count), dtype=np.float32) for _ in range(2))
-        at_rows, of_weights = as_given(rows), as_given(weights)
-        to = (ctypes.c_void_p * 3)(
-            powers.ctypes.data if with_powers else None, means.ctypes.data, loudest.ctypes.data
-        )
-        draws = draws_structure(self.on, self.clocks, k, by)
-        stage = self.kernels.library.tones_stage
-        run_kernel(stage, self.structure, draws, at, at_rows.ctypes, m, of_weights.ctypes, to)
-        return FingertipAmplitudes(means, loudest, powers if with_powers else None)
-
-
-def touch(
-    on: PlateOnEras,
-    centres: Float32Array,
-    loads: tuple[float, ...] = (),
-    clocks: ClockErrors = EXACT_CLOCKS,
-) -> TouchedPlate:
-    """Put fingers on a plate, using C kernels if they can be compiled.
-
-    centres (k, r): shapes there; loads (k,): relative to the rig's fingertip, empty for 1 each;
-    clocks: errors of the amplifiers' clocks.
-    """
-    by, plate, count = kernels(), on.plate, len(centres)
-    stiffness, stds = plate.finger_stiffness(count, loads), plate.load_stds(count, loads)
-    if by is None or not count:
-        return TouchedPlate(on, centres, stiffness, stds, clocks)
-    return TouchedByKernel(on, centres, stiffness, stds, clocks, kernels=by)
-
-
-def drawn_on(
-    on: PlateOnEras, finger_count: int, by: Drawing
-) -> tuple[Draws, int, tuple[int, int], int]:
-    """Draw plates for a number of fingers.
-
-    Returns the draws; the number of their thicknesses; the number of thicknesses for changes and
-    the index of the first one; and the index of the first thickness of the draws. If the thickness
-    is certain, only the nominal one exists.
-    """
-    plate = on.plate
-    first = on.first.get(by.thicknesses, MODELLED)
-    nodes = by.thicknesses if first else 1
-    draws = draw(
-        plate.era_count,
-        finger_count,
-        masses=plate.stiffness.shape[1] - plate.era_count,
-        to_feet=plate.by_stiffness.shape[1] - plate.era_count,
-        count=by.count,
-        seed=by.seed,
-        gain=plate.uncertainty.gain,
-        phase=math.radians(plate.uncertainty.phase_deg),
-        common_gain=plate.uncertainty.common_gain,
-        harmonic=plate.uncertainty.harmonic,
-        thicknesses=nodes,
-    )
-    first_base = on.first.get(by.bases, MODELLED)
-    return draws, nodes, (by.bases if first_base else 1, first_base), first
-
-
-def expected_power(
-    fields: Sequence[Complex64Array],
-    own: Complex64Array,
-    weights: Float32Array,
-    *,
-    gain_variance: float,
-    error_power: Float32Array,
-    shares: Float32Array | None = None,
-) -> Complex64Array:
-    """Compute expected powers R (f, g, n, n) at g groups of points.
-
-    fields: h and each of its changes (f, g, p, n); own (f, g, j, n): RMS changes over the points
-    due to the stiffness of each attachment and the load of each finger; weights (g, p): of the
-    points; error_power (f, ..., n): mean square error of each ERA's field; shares (f, n, n): by
-    which delays of amplifiers increase the power of h.
-    """
-    f, g, _, n = own.shape
-    root = np.sqrt(weights)[..., None]
-    power = gram(np.concatenate([*(each * root for each in fields), own], axis=2))
-    if shares is not None:
-        power += shares[:, None] * gram(fields[0] * root)
-    size = (weights[:, None] @ power_of(fields[0]))[:, :, 0]
-    diagonal = power.reshape(f, g, -1)[..., :: n + 1]
-    values = diagonal.real + np.float32(gain_variance) * size + error_power
-    diagonal[:] = values + np.float32(RIDGE / n) * values.sum(axis=-1, keepdims=True)
-    return power
-
-
-def gram(rows: Complex64Array) -> Complex64Array:
-    """Return the forms (..., n, n) of sums over rows (..., rows, n)."""
-    return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
-
-
-def outer(rows: Complex64Array) -> Complex64Array:
-    """Return the forms conj(h) h^T (..., n, n) of rows h (..., n)."""
-    return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
-
-
-def power_of(values: Complex64Array) -> Float32Array:
-    """Return squared magnitudes."""
-    return np.asarray(values.real * values.real + values.imag * values.imag)
-
-
-def plates_structure(on: PlateOnEras) -> TouchedPlates:
-    """Pack a plate without fingers for kernels; kept with it."""
-    known = _kept.get(on)
-    if known is not None:
-        return known
-    plate = on.plate
-    (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
-    kept = min(t, THINNER + 1)  # thicknesses that searches rank by
-    found = TouchedPlates(
-        n=plate.era_count,
-        b=b,
-        r=r,
-        t=t,
-        off=plate.by_stiffness.shape[1],
-        rows=f,
-        kept=kept,
-    )
-    found.point(
-        **{name: getattr(on, name) for name in _OF_CASES},
-        **{name: getattr(plate, name) for name in _OF_ROWS},
-        attached=plate.stiffness,
-    )
-    if (by := kernels()) is not None:
-        found.lanes = by.lanes
-        room = np.empty(2 * (f + by.lanes) * kept * b * r + _MAX_LANES, dtype=np.float32)
-        found.arrays.append(room)
-        found.of_blocks = room.ctypes.data + -room.ctypes.data % (4 * _MAX_LANES)  # whole registers
-        run_kernel(by.library.blocks_stage, found)
-    return _kept.setdefault(on, found)  # concurrent threads all take the first one
-
-
-_kept: WeakKeyDictionary[PlateOnEras, TouchedPlates] = WeakKeyDictionary()
-
-
-def draws_structure(
-    on: PlateOnEras, clocks: ClockErrors, finger_count: int, by: Drawing
-) -> PlateDraws:
-    """Pack drawn plates with a number of fingers for kernels."""
-    draws, nodes, (bases, first_base), first_node = drawn_on(on, finger_count, by)
-    exact = _structure(draws, nodes, bases, first_base, first_node)
-    if not clocks.errors:
-        return exact
-    found = PlateDraws.from_buffer_copy(exact)
-    found.arrays, found.amplifiers = exact.arrays, len(clocks.errors)
-    found.point(delays=_padded(clocks.delays(by)), amplifier=np.array(clocks.amplifier))
-    return found
-
-
-@lru_cache(maxsize=64)
-def _structure(
-    draws: Draws, nodes: int, bases: int, first_base: int, first_node: int
-) -> PlateDraws:
-    count = len(draws.node)
-    found = PlateDraws(
-        count=count,
-        bases=bases,
-        nodes=nodes,
-        width=count + _MAX_LANES,
-        first_base=first_base,
-        first_node=first_node,
-    )
-    found.point(
-        node=draws.node,
-        loss=_padded(draws.loss),
-        damping=_padded(draws.damping),
-        own=_padded(draws.own),
-        gains=_padded(np.stack([draws.gains.real, draws.gains.imag])),
-        errors=_padded(np.stack([draws.errors.real, draws.errors.imag])),
-        harmonics=_padded(np.stack([draws.harmonics.real, draws.harmonics.imag])),
-    )
-    return found
-
-
-def _padded(values: Float32Array | FloatArray) -> Float32Array:
-    """Return values (..., d) in single precision, padded by one register."""
-    return np.pad(as_given(values), [(0, 0)] * (values.ndim - 1) + [(0, _MAX_LANES)])
+    def _held(self, rows: IntArray, nodes: IntArray, free: Complex64Array) -> Complex64Array:
+        """Return coordinates (c, q, r) with the fingers, from those without."""
+        fingers = self._fingers(rows, nodes)
+        under_fingers = fingers.under_fingers(self.centres @ free.swapaxes(1, 2))
+        return fingers.coordinates(free, under_fingers)

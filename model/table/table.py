@@ -40,7 +40,8 @@ from model.ensemble.attached_plate import (
     with_places,
 )
 from model.ensemble.draws import EXACT_CLOCKS, JUDGING_DRAWS, PROMISED_DRAWS, ClockErrors
-from model.ensemble.touched_plate import TouchedPlate, touch
+from model.ensemble.kernel_plates import touch
+from model.ensemble.touched_plate import TouchedPlate
 from model.errors import InputError
 from model.finger import (
     FINE_POINTS,

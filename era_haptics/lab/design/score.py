@@ -1,9 +1,9 @@
 """Fast score of layouts, and a search for ERA positions that maximises it.
 
 The score is the expected contrast over sampled contact sets, computed like answers
-(`model.ensemble.touched_plate`, `model.drive_modes`), at a few frequencies, from the receptances of
-the free plate. Each finger loads the plate at its own position; its effect on the other fingers is
-neglected, so everything is computed once per finger. With ERAs e of dynamic stiffness Z on the
+(`model.ensemble.expected_power`, `model.drive_modes`), at a few frequencies, from the receptances
+of the free plate. Each finger loads the plate at its own position; its effect on the other fingers
+is neglected, so everything is computed once per finger. With ERAs e of dynamic stiffness Z on the
 plate, a finger f of dynamic stiffness D and its points p:
 
     K = (1 + Z A_ee)^-1,  G = A_pe K,  L = A_pf - G Z A_ef,  M = D / (1 + D L_f)
@@ -40,7 +40,7 @@ from era_haptics.lab.design.problem import (
 )
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_by, best_rows
 from model.ensemble.attached_plate import mounts_of
-from model.ensemble.touched_plate import expected_power, power_of
+from model.ensemble.expected_power import expected_power, power_of
 from model.errors import InputError
 from model.finger import FIVE_POINTS, STRONG_DB_SL, Grid, detection_threshold, fingertips_on
 from model.reduction.free_plate import solve_free_plate

@@ -27,7 +27,8 @@ from model.ensemble.draws import (
     draw,
     percentile,
 )
-from model.ensemble.touched_plate import TouchedPlate, touch
+from model.ensemble.kernel_plates import touch
+from model.ensemble.touched_plate import TouchedPlate
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
@@ -425,7 +426,7 @@ def test_thickness_is_exact_at_its_nodes(modulus):
     """
     touched, _, points = solved(Uncertainty(thickness=0.02), modulus=modulus)
     weights, nodes = np.tile(TOUCHED_PLATE_WEIGHTS, (4, 1)), thickness_nodes(5)
-    first, at = touched.on.first[5], np.arange(4)
+    first, at = touched.plate_on_eras.first[5], np.arange(4)
     found = [touched.fields(at, np.full(4, first + node), weights, points) for node in range(5)]
     for node in (0, 1, 4):
         thicker = 0.02 * float(nodes[node])
@@ -446,7 +447,7 @@ def test_thickness_is_exact_at_its_nodes(modulus):
 def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(what, rig):
     """Of a plate 3 % thicker, by central differences: within 1 % of the largest change."""
     touched, _, points = solved(Uncertainty(0, 0, 0.02, 0.01, math.e, 1.0, supports=0.3), rig=rig)
-    node = touched.on.first[5] + 4
+    node = touched.plate_on_eras.first[5] + 4
     found = changed(touched, points, np.tile(TOUCHED_PLATE_WEIGHTS, (4, 1)), node=node)[what]
     thickness = 1 + 0.02 * float(thickness_nodes(5)[4])
     more, less = (
@@ -505,7 +506,9 @@ def test_every_stage_is_that_of_numpy(rig, count):
     """
     loads = (0.4, 12.0, 2.5)[:count]  # a finger, a hand, a finger
     touched, _, points = solved(replace(Uncertainty(), supports=0.3), loads, rig=rig, count=count)
-    by_numpy = TouchedPlate(touched.on, touched.centres, touched.stiffness, touched.load_std)
+    by_numpy = TouchedPlate(
+        touched.plate_on_eras, touched.centres, touched.stiffness, touched.load_std
+    )
     weights = np.tile(TOUCHED_PLATE_WEIGHTS, (4, 1))
     few, shares = points.reshape(count, 5, -1), np.tile(FIVE_POINTS.weights, (count, 1))
     error = np.full((4, 4), 0.01, np.float32)

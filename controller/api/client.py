@@ -10,18 +10,17 @@
         async for event in era.events():
             print(event.data)
 
-`Client` runs an `AsyncClient` in an event loop on its own thread. `make pages` generates the
-methods that send a single request from their registrations in `controller/daemon/handlers.py`.
+`Client` runs an `AsyncClient` in an event loop on its own thread. A `ClientSession` is one of its
+connections, a `LeaseRenewal` keeps the plate armed. `make pages` generates the methods that send a
+single request from their registrations in `controller/daemon/handlers.py`.
 """
 
 import asyncio
 import functools
 import inspect
-import itertools
 from collections import deque
 from collections.abc import (
     AsyncIterator,
-    Awaitable,
     Callable,
     Coroutine,
     Iterator,
@@ -40,20 +39,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
 
-from controller.api.jsonrpc import ErrorCode, RpcError, request_line
+from controller.api.client_session import ClientSession
+from controller.api.jsonrpc import RpcError
+from controller.api.lease_renewal import LEASE_ENDED, LeaseRenewal
 from controller.api.link import (
     RESPONSE_TIMEOUT,
     ConnectionLost,
     DaemonLink,
-    LeaseLost,
     Notification,
     Unreachable,
     as_position,
     find_socket,
     make_params,
-    read_line,
     read_result,
-    result_of,
     touches_at,
 )
 from controller.api.methods import (
@@ -70,14 +68,13 @@ from controller.api.methods import (
     StopResult,
     StrengthResult,
 )
-from controller.api.schema import ApiMessage, Empty, Topic, headline
+from controller.api.schema import ApiMessage, Empty, Topic
 from controller.api.silencing import readable_params
 from model.errors import InputError
 from registry.threads import LoopThread, pauses
 
 MAX_QUEUED_EVENTS = 1000  # waiting to be read; the oldest is dropped
 _REPEATED_FOR = 0.3  # s; of requests that lose their connection, as happens with many clients
-_RENEWAL_INTERVAL = 0.25  # s; bounds the time until a lost lease is noticed
 
 _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=ApiMessage)
@@ -105,6 +102,20 @@ def lenient(method: _MethodT) -> _MethodT:
     return cast(_MethodT, call)
 
 
+class _Tries:
+    """Pauses between the tries of a request, within a total duration [s]."""
+
+    def __init__(self, duration: float) -> None:
+        self._end = asyncio.get_running_loop().time() + duration
+        self._pauses = pauses(first=duration / 100, maximum=duration / 10)
+
+    def next_pause(self) -> float | None:
+        """Return the pause [s] before the next try; None if no time is left for it."""
+        pause = next(self._pauses)
+        is_over = asyncio.get_running_loop().time() + pause >= self._end
+        return None if is_over else pause
+
+
 class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
     """A client of the daemon, made by `connect`; any number of calls can be pending.
 
@@ -124,20 +135,16 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         self._name = name
         self._timeout = timeout
         self._is_closed = False
-        self._opening = asyncio.Lock()
-        self._restoring = asyncio.Lock()
-        self._connections = 0
-        self._link: DaemonLink | None = None
-        self._reading: asyncio.Task[None] | None = None
-        self._pending: dict[int, asyncio.Future[Any]] = {}  # of the current connection, by id
-        self._ids = itertools.count(1)
+        self._session: ClientSession | None = None  # the current or last connection
+        self._session_count = 0
+        self._opening = asyncio.Lock()  # held while a session is opened
+        self._restoring = asyncio.Lock()  # held while its subscriptions are restored
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
-        self._restored: DaemonLink | None = None  # the connection with all subscriptions
-        self._events: deque[tuple[int, Notification]] = deque()  # with their connection numbers
+        self._events: deque[tuple[int, Notification]] = deque()  # with their session numbers
         self._lost = 0  # events dropped here before the next one
-        self._changed = asyncio.Event()  # an event arrived, or connection or lease was lost
-        self._renewing: asyncio.Task[LeaseLost] | None = None  # while armed by `armed`
-        self._seen: tuple[int, int] | None = None  # connection and epoch received last
+        self._changed = asyncio.Event()  # an event arrived, or session or lease was lost
+        self._renewal: LeaseRenewal | None = None  # of the lease of `armed`
+        self._seen: tuple[int, int] | None = None  # session number and epoch received last
 
     @classmethod
     async def connect(
@@ -153,7 +160,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         trusted (`check_peer`).
         """
         client = cls(find_socket(path), name=name, timeout=timeout)
-        await client._repeated(client._connected)
+        async with client._time_limit():
+            await client._restored_session(_Tries(_REPEATED_FOR))
         return client
 
     async def __aexit__(self, *_: object) -> None:
@@ -164,8 +172,8 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         self._is_closed = True
         self._changed.set()
         self._end_renewal()
-        if self._link is not None:
-            self._link.abort()
+        if self._session is not None:
+            self._session.abort()
         await asyncio.sleep(0)
 
     # begin: written by docs/generators/client_stub.py methods
@@ -296,15 +304,21 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             with suppress(RpcError, Unreachable):  # if rejected: another client's lease
                 await self.disarm(lease=(await arming).lease)
             raise
-        self._renewing = asyncio.create_task(self._renewed(lease), name="lease")
-        self._renewing.add_done_callback(lambda _: self._changed.set())
+        renewal = LeaseRenewal(
+            lease,
+            request=self.request,
+            status=self.status,
+            stopped=self._changed.set,
+            path=self.path,
+        )
+        self._renewal = renewal
         try:
             yield lease
         except BaseException:
             with suppress(RpcError, Unreachable):
-                await self._disarmed(lease)
+                await self._disarm_after(renewal)
             raise
-        await self._disarmed(lease)
+        await self._disarm_after(renewal)
 
     async def events(self) -> AsyncIterator[Notification]:
         """Yield notifications as they arrive, until `close`; raises Unreachable."""
@@ -325,14 +339,14 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                 while not self._events and not self._is_closed:
                     self._check_lease()
                     self._changed.clear()
-                    await self._repeated(
-                        self._connected, (RpcError, Unreachable), duration=0.9 * self._timeout
-                    )
+                    async with self._time_limit():
+                        tries = _Tries(0.9 * self._timeout)
+                        await self._restored_session(tries, (RpcError, Unreachable))
                     await self._changed.wait()
         if not self._events:
             return None
-        connection, event = self._events.popleft()
-        self._see(connection, event.data.get("epoch"))
+        session_number, event = self._events.popleft()
+        self._see(session_number, event.data.get("epoch"))
         lost = event.lost + self._lost
         self._lost = 0
         return replace(event, lost=lost)
@@ -352,7 +366,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         read = read_result(await self.request(method, params), result)
         if method == "hello":
             self._name = values["client"]
-        self._see(self._connections, getattr(read, "epoch", None))
+        self._see(self._session_count, getattr(read, "epoch", None))
         return read
 
     async def _silence(
@@ -367,7 +381,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         params = readable_params(method, values)
         read = read_result(await self.request(method, params), result)
         self._end_renewal()
-        self._see(self._connections, getattr(read, "epoch", None))
+        self._see(self._session_count, getattr(read, "epoch", None))
         try:
             make_params(method, **values)
         except InputError as error:
@@ -380,183 +394,129 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         Returns its result as parsed JSON, including unknown keys of a newer daemon. Requests that
         silence are sent before subscriptions are restored.
         """
-        connected = self._opened if method in SILENCING else self._connected
+        tries = _Tries(_REPEATED_FOR)
+        repeated_after: tuple[type[Unreachable], ...] = ()
+        if METHODS[method].is_repeated:
+            repeated_after = (Unreachable if method == "stop" else ConnectionLost,)
+        async with self._time_limit():
+            while True:
+                try:
+                    if method in SILENCING:
+                        session = await self._open_session(tries)
+                    else:
+                        session = await self._restored_session(tries)
+                    return await session.call(method, params)
+                except repeated_after as error:
+                    await self._pause_after(error, tries)
 
-        async def attempt() -> Any:
-            return await self._exchange(await self._repeated(connected), method, params)
-
-        again = Unreachable if method == "stop" else ConnectionLost
-        return await self._repeated(attempt, again if METHODS[method].is_repeated else ())
-
-    async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:
-        """Send a request over the current connection; raises RpcError and Unreachable.
-
-        A connection that was lost raises immediately, because nobody reads its responses any more.
-        """
-        if not link.is_open:
-            raise Unreachable.at(self.path, ConnectionResetError("closed by the daemon"))
-        id = next(self._ids)
-        pending = self._pending
-        response = asyncio.get_running_loop().create_future()
-        pending[id] = response
-        try:
-            content = params.model_dump_json(exclude_none=True)
-            link.write(request_line(id, method, content.encode()))
-            return result_of(await response)
-        finally:
-            del pending[id]
-
-    async def _repeated(
-        self,
-        attempt: Callable[[], Awaitable[_T]],
-        after: type[Exception] | tuple[type[Exception], ...] = ConnectionLost,
-        *,
-        duration: float = _REPEATED_FOR,
-    ) -> _T:
-        """Return the result of an attempt; repeat it for a while [s] after some errors.
-
-        Raises Unreachable if it does not end within the client's timeout.
-        """
-        loop = asyncio.get_running_loop()
-        end = loop.time() + duration
-        following = pauses(first=duration / 100, maximum=duration / 10)
+    @asynccontextmanager
+    async def _time_limit(self) -> AsyncIterator[None]:
+        """Raise Unreachable, and close the session, after the client's timeout."""
         try:
             async with asyncio.timeout(self._timeout):
-                while True:
-                    try:
-                        return await attempt()
-                    except after:
-                        pause = next(following)
-                        if self._is_closed or loop.time() + pause >= end:
-                            raise
-                        await asyncio.sleep(pause)
+                yield
         except TimeoutError as error:
-            if self._link is not None:  # otherwise its queue would grow without bounds
-                self._link.abort()
+            if self._session is not None:  # otherwise its queue would grow without bounds
+                self._session.abort()
             raise Unreachable.at(self.path, error) from error
 
-    async def _connected(self) -> DaemonLink:
-        """Return the connection with all subscriptions; raises RpcError and Unreachable."""
-        async with self._restoring:
-            link = await self._opened()
-            if link is not self._restored:
-                await self._restore(link)
-            return link
+    async def _pause_after(self, error: Exception, tries: _Tries) -> None:
+        """Wait before the next try; raise the error of the last try if there is none."""
+        pause = tries.next_pause()
+        if self._is_closed or pause is None:
+            raise error
+        await asyncio.sleep(pause)
 
-    async def _opened(self) -> DaemonLink:
-        """Return the connection, reconnecting if it was lost; raises RpcError and Unreachable."""
+    async def _restored_session(
+        self,
+        tries: _Tries,
+        repeated_after: tuple[type[Exception], ...] = (ConnectionLost,),
+    ) -> ClientSession:
+        """Return a session with all subscriptions; raises RpcError and Unreachable.
+
+        repeated_after: errors after which to try again.
+        """
+        while True:
+            try:
+                async with self._restoring:
+                    session = await self._opened()
+                    if not session.is_restored:
+                        await self._restore(session)
+                    return session
+            except repeated_after as error:
+                await self._pause_after(error, tries)
+
+    async def _open_session(self, tries: _Tries) -> ClientSession:
+        """Return a session, perhaps without subscriptions; raises RpcError and Unreachable."""
+        while True:
+            try:
+                return await self._opened()
+            except ConnectionLost as error:
+                await self._pause_after(error, tries)
+
+    async def _opened(self) -> ClientSession:
+        """Return the session, a new one if it was lost; raises RpcError and Unreachable."""
         async with self._opening:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
-            if self._link is None or not self._link.is_open:
-                self._link = await DaemonLink.open(self.path, self._name)
-                self._pending = {}
-                self._ids = itertools.count(1)
-                self._connections += 1
-                reading = self._read(self._link, self._pending, self._connections)
-                self._reading = asyncio.create_task(reading, name="API")
-            return self._link
+            if self._session is None or not self._session.is_open:
+                link = await DaemonLink.open(self.path, self._name)
+                self._session_count += 1
+                number = self._session_count
+                self._session = ClientSession(
+                    link,
+                    received=lambda event: self._queue(number, event),
+                    lost=self._changed.set,
+                )
+            return self._session
 
-    async def _restore(self, link: DaemonLink) -> None:
-        """Restore subscriptions on a new connection; close it if that fails."""
+    async def _restore(self, session: ClientSession) -> None:
+        """Restore subscriptions in a new session; close it if that fails."""
         try:
             for topic, rate in list(self._rates.items()):
                 params = make_params("subscribe", topics=[topic], rate_hz=rate)
-                await self._exchange(link, "subscribe", params)
-            self._restored = link
+                await session.call("subscribe", params)
+            session.is_restored = True
         except BaseException:
-            link.abort()
+            session.abort()
             raise
 
-    async def _read(
-        self, link: DaemonLink, pending: dict[int, asyncio.Future[Any]], connection: int
-    ) -> None:
-        """Dispatch responses and events until the connection is lost; then fail pending calls."""
-        try:
-            while True:
-                received = read_line(await link.next_line())
-                if isinstance(received, Notification):
-                    if len(self._events) == MAX_QUEUED_EVENTS:
-                        _, dropped = self._events.popleft()
-                        self._lost += 1 + dropped.lost
-                    self._events.append((connection, received))
-                    self._changed.set()
-                    continue
-                for id, response in pending.items():  # a response without an id is for all
-                    if received["id"] in (id, None) and not response.done():
-                        response.set_result(received)
-        except Unreachable as error:
-            link.abort()
-            for response in pending.values():
-                if not response.done():
-                    response.set_exception(error)
+    def _queue(self, session_number: int, event: Notification) -> None:
+        """Append an event; drop the oldest if too many wait."""
+        if len(self._events) == MAX_QUEUED_EVENTS:
+            _, dropped = self._events.popleft()
+            self._lost += 1 + dropped.lost
+        self._events.append((session_number, event))
         self._changed.set()
 
-    def _see(self, connection: int, epoch: int | None) -> None:
-        """Store the latest epoch received; on a new connection, it can be lower than before."""
+    def _see(self, session_number: int, epoch: int | None) -> None:
+        """Store the latest epoch received; in a new session, it can be lower than before."""
         if epoch is not None:
-            self._seen = max(self._seen or (0, 0), (connection, epoch))
+            self._seen = max(self._seen or (0, 0), (session_number, epoch))
 
     def _check_lease(self) -> None:
         """Raise LeaseLost once the lease of `armed` is lost."""
-        if self._renewing is not None and self._renewing.done():
-            raise self._renewing.result().with_traceback(None)
+        if self._renewal is not None:
+            self._renewal.check()
 
     def _end_renewal(self) -> None:
         """Stop renewing the lease, unless it is lost."""
-        if self._renewing is not None and not self._renewing.done():
-            self._renewing.cancel()
-            self._renewing = None
+        if self._renewal is not None:
+            self._renewal.end()
 
-    async def _disarmed(self, lease: ArmResult) -> None:
+    async def _disarm_after(self, renewal: LeaseRenewal) -> None:
         """End `armed`: disarm unless already done; raises LeaseLost if the lease was lost."""
-        renewing = self._renewing
-        self._renewing = None
-        if renewing is None:
+        self._renewal = None
+        renewal.check()
+        if renewal.is_ended:
             return
-        if renewing.done():
-            raise renewing.result().with_traceback(None)
-        renewing.cancel()
+        renewal.end()
         try:
-            await self.disarm(lease=lease.lease)
+            await self.disarm(lease=renewal.token)
         except RpcError as error:
-            if error.code not in (ErrorCode.LEASE, ErrorCode.WRONG_STATE):
+            if error.code not in LEASE_ENDED:
                 raise
-            raise await self._loss(error) from error
-
-    async def _renewed(self, lease: ArmResult) -> LeaseLost:
-        """Renew a lease until it is lost, reconnecting if necessary; return the reason of the loss.
-
-        While no daemon responds, retries until the lease expires. Nothing arms again: a lease
-        ended by the daemon is lost.
-        """
-        loop = asyncio.get_running_loop()
-        params = make_params("renew", lease=lease.lease)
-        expires_at = loop.time() + lease.lease_s
-        reason: RpcError | Unreachable | None = None
-        while loop.time() < expires_at:
-            await asyncio.sleep(min(_RENEWAL_INTERVAL, expires_at - loop.time()))
-            sent_at = loop.time()
-            try:
-                async with asyncio.timeout_at(expires_at):
-                    await self.request("renew", params)
-                expires_at = sent_at + lease.lease_s
-                reason = None
-            except TimeoutError:
-                break
-            except (RpcError, Unreachable) as error:
-                reason = error
-                if isinstance(error, RpcError) and error.code is not ErrorCode.BUSY:
-                    break
-        return await self._loss(reason or Unreachable.at(self.path, TimeoutError()))
-
-    async def _loss(self, reason: RpcError | Unreachable) -> LeaseLost:
-        """Return the loss of the lease, with the daemon's cause if the daemon rejected it."""
-        if isinstance(reason, RpcError):
-            with suppress(RpcError, Unreachable):
-                status = await self.status()
-                return LeaseLost(headline(status.state, status.cause))
-        return LeaseLost(str(reason))
+            raise await renewal.loss(error) from error
 
 
 _P = ParamSpec("_P")

@@ -305,6 +305,10 @@ class DaemonLink:
         """Whether neither side has closed it."""
         return not (self._writer.is_closing() or self._reader.at_eof() or self._reader.exception())
 
+    def closed_by_daemon(self) -> Unreachable:
+        """Return the error of requests after the daemon has closed the connection."""
+        return Unreachable.at(self._path, ConnectionResetError("closed by the daemon"))
+
     async def send(self, line: bytes) -> None:
         """Send a line with its line feed once the daemon reads; raises Unreachable."""
         self.write(line)
@@ -325,7 +329,7 @@ class DaemonLink:
             except OSError as error:
                 raise Unreachable.at(self._path, error) from error
             if not data:
-                raise Unreachable.at(self._path, ConnectionResetError("closed by the daemon"))
+                raise self.closed_by_daemon()
             self._received += data
         line, _, self._received = self._received.partition(b"\n")
         return line

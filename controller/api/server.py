@@ -1,4 +1,4 @@
-"""API server and notification hub, running in the control loop's event loop.
+"""API server, running in the control loop's event loop.
 
 A `Connection` never waits. Its input is processed line by line, and both its unserved input and its
 unread output are bounded. `ApiServer` serves the connections in turns of 0.1 ms plus at most one
@@ -8,7 +8,7 @@ have separate turns that never wait.
 
 The number of clients is bounded. Additional clients get reserve connections, which serve only
 methods that silence, so that another client can always connect and `stop`. Slow methods, such as
-arming, run as tasks. `TOPICS` (`controller/api/methods.py`) defines how often each topic is sent.
+arming, run as tasks. `Hub` (`controller/api/hub.py`) sends notifications to the connections.
 
 A request that silences is carried out before its other parts are checked, and counts towards no
 limit (`controller/api/silencing.py`). Its errors are reported afterwards.
@@ -20,7 +20,7 @@ import math
 import socket
 import time
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeAlias, cast
 
@@ -31,20 +31,14 @@ from controller.api.jsonrpc import (
     InvalidRequest,
     RpcError,
     error_line,
-    event_line,
     read_params,
     read_request,
     result_line,
     unknown_method,
 )
 from controller.api.link import credentials_of
-from controller.api.methods import METHODS, TOPICS, TouchParams
-from controller.api.schema import (
-    MAX_RATE,
-    ApiMessage,
-    Empty,
-    Topic,
-)
+from controller.api.methods import METHODS, TouchParams
+from controller.api.schema import ApiMessage
 from controller.api.silencing import read_silencing
 from controller.process.log import RateLimiter
 from controller.sources.touch import CONTACT_TIMEOUT
@@ -60,7 +54,6 @@ MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
 MAX_PENDING = 8  # slow requests per client; requests that silence are always accepted
 MAX_PENDING_STOPS = 64  # requests without responses; above it no further line is read
 STOP = b'"stop"'
-DEFAULT_RATE = 10.0  # Hz; of periodic notifications
 
 MAX_CONNECTIONS = 32  # for all methods
 RESERVE = 8  # additional connections, for the reserve methods only
@@ -89,9 +82,8 @@ class Connection(asyncio.BufferedProtocol):
         self.is_reserve = False  # whether it is in reserve
         self.is_at_end = False  # whether no further line is read or served
         self.pending: set[asyncio.Task[None]] = set()
-        self.silenced = 0  # its stops and disarms
+        self.silencing_count = 0  # its stops and disarms so far
         self.touched_at = -math.inf  # s; when it last sent fingers, unless it has lifted them since
-        self.topics: dict[Topic, asyncio.TimerHandle | None] = {}  # subscriptions; None: aperiodic
         self.lease = ""  # token of the last lease it armed or renewed
         self.number: int | None = None  # index among the clients that have touched
         self.rate = RateLimiter(MAX_REQUEST_RATE, clock=server.clock)
@@ -164,7 +156,13 @@ class Connection(asyncio.BufferedProtocol):
 
     def connection_lost(self, error: Exception | None) -> None:
         """Report the end; pending requests are still carried out."""
-        self._server.forget(self)
+        self._server.client_lost(self)
+
+    def note(self, method: str, params: ApiMessage | None) -> None:
+        """Record that the client silences or touches."""
+        self.silencing_count += METHODS[method].silences
+        if isinstance(params, TouchParams):
+            self.touched_at = self._server.clock() if params.touches else -math.inf
 
     def next_line(self) -> bytes:
         """Take the next line, or the start of an overlong line and stop reading."""
@@ -285,6 +283,11 @@ class _Call:
             return False
         return self.error is not None or METHODS[self.method].is_limited
 
+    @property
+    def lacks_reply(self) -> bool:
+        """Whether its method needs a reply, such as a lease, that the client did not request."""
+        return METHODS[self.method].needs_reply and not self.expects_response
+
 
 class ApiServer:
     """Serves the methods of the API to clients on a Unix socket.
@@ -340,7 +343,7 @@ class ApiServer:
 
     def admit(self, new: Connection) -> None:
         """Admit a new client, if necessary in place of another, or close it."""
-        new.is_reserve = not self._has_room()
+        new.is_reserve = not self._make_room()
         if new.is_reserve:
             reserve = [client for client in self.clients if client.is_reserve]
             if len(reserve) >= RESERVE:
@@ -362,8 +365,11 @@ class ApiServer:
         self.clients.pop(evicted, None)
         evicted.abort()
 
-    def _has_room(self) -> bool:
-        """Whether a full connection is free, if necessary by evicting the longest idle client."""
+    def _make_room(self) -> bool:
+        """Free a full connection, if necessary by evicting the longest idle client.
+
+        Returns whether one is free.
+        """
         full = [client for client in self.clients if not client.is_reserve]
         if len(full) < MAX_CONNECTIONS:
             return True
@@ -375,9 +381,9 @@ class ApiServer:
         evicted.abort()
         return True
 
-    def forget(self, client: Connection) -> None:
-        """Forget a client that has disconnected; first carry out stops left in its input."""
-        self._end_input(client)
+    def client_lost(self, client: Connection) -> None:
+        """Carry out stops left in the input of a lost client, then remove it."""
+        self._serve_last_stops(client)
         self.clients.pop(client, None)
         self._waiting.pop(client, None)
         self._on_disconnect(client)
@@ -457,15 +463,16 @@ class ApiServer:
         if call.is_limited and not client.rate.take():
             if call.error is not None:
                 client.respond(error_line(None, _busy()))
-                self._end_input(client)
+                self._serve_last_stops(client)
                 return
             call.error = _busy()
         try:
             if not call.silences:
                 self._check(client, call)
-            self._note(client, call)
-            handle = self._handler(client, call)
-            result = handle()
+            client.note(call.method, call.params)
+            if call.lacks_reply:
+                return
+            result = self._start(client, call)
             if isinstance(result, ApiMessage):
                 self._respond(client, call, result)
                 return
@@ -478,36 +485,28 @@ class ApiServer:
         client.pending.add(task)
         task.add_done_callback(lambda task: self._finished(client, task))
 
-    def _end_input(self, client: Connection) -> None:
-        """Serve no further line of a client, except remaining requests that silence."""
+    def _serve_last_stops(self, client: Connection) -> None:
+        """Carry out the waiting requests of a client that silence, and end its input."""
         lines = client.take_lines()
         if read_silencing(lines) is not None:
             self._serve(client, lines)
 
-    def _note(self, client: Connection, call: _Call) -> None:
-        """Record that a client silences or touches."""
-        client.silenced += METHODS[call.method].silences
-        if isinstance(call.params, TouchParams):
-            client.touched_at = self.clock() if call.params.touches else -math.inf
-
-    def _handler(
-        self, client: Connection, call: _Call
-    ) -> Callable[[], ApiMessage | Awaitable[ApiMessage]]:
-        """Return the handler of a call; an arm handler first waits for more input."""
-        method = METHODS[call.method]
+    def _start(self, client: Connection, call: _Call) -> ApiMessage | Awaitable[ApiMessage]:
+        """Call the handler of a method; an arm handler first waits for more input."""
         handle = partial(self._handlers[call.method], client, call.params)
-        if not method.needs_reply:
-            return handle
-        if not call.expects_response:
-            return _skip
-        return partial(_handle_unless_withdrawn, client, client.silenced, handle)
+        if METHODS[call.method].needs_reply:
+            return _handle_unless_withdrawn(client, client.silencing_count, handle)
+        return handle()
 
     def _check(self, client: Connection, call: _Call) -> None:
-        """Raise an error if a call must not be carried out; calls that silence always are."""
+        """Raise an error if a call must not be carried out.
+
+        Moves the client out of the reserve if there is room.
+        """
         if call.error is not None:
             raise call.error
         if client.is_reserve and not METHODS[call.method].in_reserve:
-            client.is_reserve = not self._has_room()
+            client.is_reserve = not self._make_room()
             if client.is_reserve:
                 raise RpcError(
                     ErrorCode.BUSY,
@@ -543,21 +542,18 @@ class ApiServer:
             client.respond(response)
 
 
-def _skip() -> ApiMessage:
-    """Do nothing for an arm without an id: its client would never receive the lease."""
-    return Empty()
-
-
 async def _handle_unless_withdrawn(
-    client: Connection, silenced: int, handle: Callable[[], ApiMessage | Awaitable[ApiMessage]]
+    client: Connection,
+    silencing_count: int,
+    handle: Callable[[], ApiMessage | Awaitable[ApiMessage]],
 ) -> ApiMessage:
     """Handle a request, unless the client leaves or silences all amplifiers in the same bytes.
 
-    silenced: number of its stops and disarms before the request.
+    silencing_count: number of its stops and disarms before the request.
     """
     for _ in range(2):  # iterations that receive the end of its input
         await asyncio.sleep(0)
-    if client.silenced != silenced:
+    if client.silencing_count != silencing_count:
         raise RpcError(ErrorCode.LEASE, "stopped or disarmed meanwhile", remedy="arm again")
     if client.has_left:
         raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
@@ -591,121 +587,3 @@ def _carried_out_despite(error: RpcError, method: str) -> RpcError:
     data = error.data
     problem = f"{data.what} ({method} was carried out nevertheless)"
     return RpcError(error.code, problem, where=data.where, remedy=data.remedy)
-
-
-class Hub:
-    """Sends notifications to subscribers.
-
-    current: returns the current data of a topic, or None.
-    """
-
-    def __init__(
-        self,
-        current: Mapping[Topic, Callable[[], ApiMessage | None]],
-        *,
-        clock: Callable[[], float],
-    ) -> None:
-        self._current = current
-        self._clock = clock
-        self._subscribers: dict[Connection, None] = {}  # ordered by first subscription
-        self._newest: dict[Topic, Callable[[], ApiMessage | None]] = {}
-        self._flush: asyncio.TimerHandle | None = None
-        self._flushed_at = -1.0
-        self._failing: set[Topic] = set()
-        self.lost = Counter[str]()
-        """Number of notifications dropped because clients read too slowly, by topic."""
-
-    def subscribe(
-        self, connection: Connection, topics: Iterable[Topic], *, rate: float | None = None
-    ) -> None:
-        """Add topics, and send their current data; rate [Hz]: rate of periodic topics."""
-        new = sorted(set(topics))
-        self.unsubscribe(connection, new)
-        self._subscribers[connection] = None
-        connection.topics.update(dict.fromkeys(new))
-        for topic in new:
-            if topic in self._current:
-                self._send([connection], topic, self._current[topic])
-            if TOPICS[topic].sent == "periodically":
-                self._start_timer(connection, topic, 1 / (rate or DEFAULT_RATE))
-
-    def unsubscribe(self, connection: Connection, topics: Iterable[Topic]) -> None:
-        """Remove topics."""
-        for topic in topics:
-            timer = connection.topics.pop(topic, None)
-            if timer is not None:
-                timer.cancel()
-
-    def forget(self, connection: Connection) -> None:
-        """Remove a client that has disconnected."""
-        self.unsubscribe(connection, [*connection.topics])
-        self._subscribers.pop(connection, None)
-
-    def publish(self, topic: Topic, make_data: Callable[[], ApiMessage | None]) -> None:
-        """Send to all subscribers; make_data is called only if there are any.
-
-        Nothing is sent if it returns None, for outdated data.
-        """
-        if TOPICS[topic].sent != "newest":
-            self._send(self._of(topic), topic, make_data)
-            return
-        if not self._subscribers:
-            return
-        self._newest.pop(topic, None)  # sent in order of the newest change
-        self._newest[topic] = make_data
-        if self._flush is None:
-            delay = max(0.0, self._flushed_at + 1 / MAX_RATE - self._clock())
-            self._flush = asyncio.get_running_loop().call_later(delay, self._flush_now)
-
-    def close(self) -> None:
-        """Remove all clients."""
-        for connection in list(self._subscribers):
-            self.forget(connection)
-        if self._flush is not None:
-            self._flush.cancel()
-
-    def _flush_now(self) -> None:
-        self._flush = None
-        self._flushed_at = self._clock()
-        newest = self._newest
-        self._newest = {}
-        for topic, make_data in newest.items():
-            self._send(self._of(topic), topic, make_data)
-
-    def _of(self, topic: Topic) -> list[Connection]:
-        return [connection for connection in self._subscribers if topic in connection.topics]
-
-    def _send(
-        self,
-        subscribers: Sequence[Connection],
-        topic: Topic,
-        make_data: Callable[[], ApiMessage | None],
-    ) -> None:
-        if not subscribers:
-            return
-        try:
-            message = make_data()
-            data = b"" if message is None else message.model_dump_json().encode()
-        except Exception:  # the next change is still sent
-            if topic not in self._failing:  # log once; marked, because the log is also a topic
-                _logger.exception("topic %s: no data made", topic, extra={"topic": topic})
-            self._failing.add(topic)
-            return
-        self._failing.discard(topic)
-        if message is None:
-            return
-        now = self._clock()
-        for connection in subscribers:
-            self.lost[topic] += connection.notify(
-                lambda lost: event_line(topic, time=now, lost=lost, data=data)
-            )
-
-    def _start_timer(self, connection: Connection, topic: Topic, period: float) -> None:
-        """Send a topic every period [s]."""
-
-        def send() -> None:
-            self._send([connection], topic, self._current[topic])
-            self._start_timer(connection, topic, period)
-
-        loop = asyncio.get_running_loop()
-        connection.topics[topic] = loop.call_later(period, send)

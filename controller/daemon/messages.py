@@ -15,6 +15,7 @@ from importlib.metadata import version
 
 import numpy as np
 
+from controller.api.hub import Hub
 from controller.api.methods import (
     AmplifiersEvent,
     EffectsResult,
@@ -37,7 +38,6 @@ from controller.api.schema import (
     RigSummary,
     TableSummary,
 )
-from controller.api.server import Hub
 from controller.daemon.config import DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.plate_view import PlateView

@@ -36,10 +36,10 @@ import live_demonstration
 import model
 from cases import in_turn, shortly
 from controller.api.client import Client
+from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import LayoutEvent, PatternEvent, StateEvent
 from controller.api.schema import ContactStatus, DaemonStateName
-from controller.api.server import Hub
 from controller.demo.recorder import TouchRecorder
 from controller.gateway.app import MAX_SESSIONS
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard

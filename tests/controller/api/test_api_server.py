@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 
 from controller.api import server
 from controller.api.client import AsyncClient, Client
+from controller.api.hub import Hub
 from controller.api.jsonrpc import (
     ErrorCode,
     InvalidRequest,
@@ -45,7 +46,7 @@ from controller.api.methods import (
     SubscribeParams,
 )
 from controller.api.schema import MAX_RATE, ApiMessage, Empty
-from controller.api.server import MAX_UNREAD_BYTES, ApiServer, Connection, Hub
+from controller.api.server import MAX_UNREAD_BYTES, ApiServer, Connection
 from controller.gateway.field import DrawnField
 from kit.clock import feed, in_virtual_time
 from kit.courses import Taken, courses, follow
@@ -713,9 +714,10 @@ async def test_hub_sends_each_periodic_topic_at_its_own_rate() -> None:
     loop = asyncio.get_running_loop()
     hub.subscribe(connection, ["amplifiers"], rate=2.0)
     hub.subscribe(connection, ["latency"], rate=50.0)
-    timers = {topic: cast(asyncio.TimerHandle, timer) for topic, timer in connection.topics.items()}
+    topics = hub.subscriptions[connection]
+    timers = {topic: cast(asyncio.TimerHandle, timer) for topic, timer in topics.items()}
     due = {topic: timer.when() - loop.time() for topic, timer in timers.items()}
     assert due == pytest.approx({"amplifiers": 0.5, "latency": 0.02}, abs=0.015)
     hub.forget(connection)
     assert all(timer.cancelled() for timer in timers.values())
-    assert not connection.topics
+    assert not hub.subscriptions

@@ -31,6 +31,7 @@ from websockets.typing import Subprotocol
 from websockets.uri import parse_uri
 
 from controller.api.client import Client
+from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
     METHODS,
@@ -58,7 +59,7 @@ from controller.api.schema import (
     TableSummary,
     Topic,
 )
-from controller.api.server import ApiServer, Connection, Hub
+from controller.api.server import ApiServer, Connection
 from kit.plates import write_rig
 from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable

@@ -41,17 +41,17 @@ class WaitingChanges:
         changes = self._tracker.changed
         waiting = {**changes, **self._for_choice}
         if choice is None:
-            changes.clear()
+            self._tracker.forget_changes()
             self._choice = None
             self._for_choice = {}
             return waiting
         keys: set[ContactKey | None] = {None, *_contact_keys_of_pulses(started)}
         answered = _among(keys, waiting)
         if choice is self._choice:
-            changes.pop(None, None)
+            self._tracker.forget_lifts()
             return answered
         for_choice = _among(changes.keys() - keys, changes)
-        changes.clear()
+        self._tracker.forget_changes()
         has_lasting_start = any(not content.target.is_short for content in started)
         if has_lasting_start:
             answered |= self._for_choice

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from controller.sources.contact_load import IN_MM, LANDING, MIN_CHANGE, followed
 from controller.sources.touch import AT_REST, Change, Contact, ContactKey, Touch, TouchFrame
@@ -30,6 +30,13 @@ TAP_TIME = 0.060
 """Such a contact is kept for this time [s], so that a click can be selected, loaded and felt."""
 
 
+_IndexedSource: TypeAlias = tuple[int, str]
+"""Index of a contact, in order of arrival, and its source."""
+
+_Grouping: TypeAlias = Callable[[str], str]
+"""Returns the group of a source."""
+
+
 class ContactTracker:
     """Follows the contacts on one plate; times are arguments.
 
@@ -47,13 +54,25 @@ class ContactTracker:
         """All contacts in order of arrival, newest last."""
         self.next_expiry = math.inf
         """Time [s] when the next contacts are lifted, unless a frame of their source arrives."""
-        self.changed: dict[ContactKey | None, float] = {}
-        """Time [s] of each contact's first change not yet answered by a set; None: first lift."""
+        self._changed: dict[ContactKey | None, float] = {}
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
         self._frames: dict[str, TouchFrame] = {}  # last frame of each source
         self._tap_ends: dict[ContactKey, float] = {}  # s; of contacts that are lifted already
         self._newest = -math.inf  # s; time of the newest frame
+
+    @property
+    def changed(self) -> Mapping[ContactKey | None, float]:
+        """Time [s] of each contact's first change not yet answered by a set; None: first lift."""
+        return self._changed
+
+    def forget_changes(self) -> None:
+        """Forget all changes, which are answered."""
+        self._changed.clear()
+
+    def forget_lifts(self) -> None:
+        """Forget that contacts were lifted, which is answered."""
+        self._changed.pop(None, None)
 
     def expiry_of(self, key: ContactKey) -> float:
         """Return the time [s] when a contact is lifted unless a frame arrives; -inf if unknown."""
@@ -108,7 +127,7 @@ class ContactTracker:
         """Mark contacts as changed since these times [s]: their answer was not played."""
         for key, at in answered.items():
             waiting = key if key in self._contacts else None  # lifted meanwhile
-            self.changed[waiting] = min(at, self.changed.get(waiting, at))
+            self._changed[waiting] = min(at, self._changed.get(waiting, at))
 
     def _contact(
         self, key: ContactKey, touch: Touch, former: Contact | None, time: float
@@ -130,8 +149,10 @@ class ContactTracker:
         reported = self._reported_load(touch)
         largest = max(load, reported or 0.0)
         if largest > MAX_FINGER_LOAD:
-            largest = min(largest, MAX_HAND_LOAD)
-            return Contact(key, x, y, since, load if largest < MIN_CHANGE * load else largest)
+            hand_load = min(largest, MAX_HAND_LOAD)
+            if hand_load < MIN_CHANGE * load:
+                hand_load = load
+            return Contact(key, x, y, since, hand_load)
         if reported is not None and time - since >= LANDING:
             load = followed(load, reported)
         return Contact(key, x, y, since, load, motion.followed(time, x, y))
@@ -222,10 +243,10 @@ class ContactTracker:
     ) -> None:
         """Note when [s] contacts changed or were lifted, unless an earlier change is noted."""
         for contact in up:
-            changed_at = self.changed.pop(contact.key, time)
-            self.changed[None] = min(changed_at, self.changed.get(None, time))
+            changed_at = self._changed.pop(contact.key, time)
+            self._changed[None] = min(changed_at, self._changed.get(None, time))
         for contact in contacts:
-            self.changed.setdefault(contact.key, time)
+            self._changed.setdefault(contact.key, time)
 
 
 def _valid_touches(
@@ -256,20 +277,32 @@ def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) 
     contacts, if it has at least two more than the new contact's. sources: sources of all contacts
     in order of arrival; origins: by source.
     """
-    groupings: tuple[Callable[[str], str], ...] = (_input_of, origins.__getitem__, str)
-    candidates: list[int] = [*range(len(sources))]
+    groupings: tuple[_Grouping, ...] = (_input_of, origins.__getitem__, str)
+    contacts = list(enumerate(sources))
     for depth, group_of in enumerate(groupings):
-        counts = Counter(group_of(sources[index]) for index in candidates)
+        counts = Counter(group_of(source) for _, source in contacts)
         own_group = group_of(newcomer)
         if max(counts.values(), default=0) > counts[own_group] + 1:
-            for deeper_group_of in groupings[depth:]:
-                groups = [deeper_group_of(sources[index]) for index in candidates]
-                ((fullest, _),) = Counter(groups).most_common(1)
-                pairs = zip(candidates, groups, strict=True)
-                candidates = [index for index, group in pairs if group == fullest]
-            return candidates[-1]
-        candidates = [index for index in candidates if group_of(sources[index]) == own_group]
+            return _newest_of_fullest(contacts, groupings[depth:])
+        contacts = _members(contacts, group_of, own_group)
     return None
+
+
+def _newest_of_fullest(contacts: list[_IndexedSource], groupings: Sequence[_Grouping]) -> int:
+    """Return the index of the newest contact in the fullest group, its fullest subgroup, etc."""
+    for group_of in groupings:
+        counts = Counter(group_of(source) for _, source in contacts)
+        ((fullest, _),) = counts.most_common(1)
+        contacts = _members(contacts, group_of, fullest)
+    newest, _ = contacts[-1]
+    return newest
+
+
+def _members(
+    contacts: list[_IndexedSource], group_of: _Grouping, group: str
+) -> list[_IndexedSource]:
+    """Return the contacts in a group."""
+    return [contact for contact in contacts if group_of(contact[1]) == group]
 
 
 def _input_of(source: str) -> str:

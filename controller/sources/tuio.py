@@ -12,8 +12,9 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from itertools import islice, product
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from controller.sources.osc import Argument, osc_messages, read_message
 from controller.sources.touch import Touch, TouchFrame
@@ -42,19 +43,32 @@ _MAX_MESSAGES = 256  # per datagram: some 4 ms, and ten times the maximum number
 _MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # OSC string, NUL-padded
-# Like in the reference client, a sequence number that drops by more than 100 is a restarted sender.
-# A pause reveals a restart within the first 100 frames: reordered frames are never this late.
+# As in the reference client, a frame number that drops by more than 100 is from a restarted sender.
 _LATE_FRAMES = 100
 # Senders such as the reference implementation are silent while fingers rest; some repeat the alive
 # message once a second.
 DEFAULT_TIMEOUT = 3.0  # s
 RESTART_PAUSE = 0.5
-"""Time [s] without a datagram after which a sender at another port counts as the same sender."""
+"""Time [s] without a datagram after which a sender may have been restarted.
+
+Reordered frames are never this late.
+"""
 
 MUTE_AFTER = 10.0
 """Time [s] without cursors after which a sender that should send counts as mute."""
 
 _MIN_REPEATS = 20  # consecutive frames without cursors, of a sender that repeats frames at rest
+
+
+class _Advance(Enum):
+    """How far a bundle advances the frame number of its sender, in the same profile."""
+
+    UNNUMBERED = "no number, or a redundant bundle"
+    SAME = "another part of the same frame"
+    NEXT = "at most 100 frames later"
+    LATER = "more than 100 frames later"
+    EARLIER = "at most 100 frames earlier"
+    FAR_EARLIER = "more than 100 frames earlier"
 
 
 @dataclass
@@ -66,6 +80,17 @@ class _Profile:
     sequence: int = -1  # negative until numbered
     numbered_at: float = -math.inf  # s; when that number arrived
     last_heard: float = -math.inf  # s
+
+    def advance_to(self, update: "_Profile") -> _Advance:
+        """Return how far the frame number of an update advances."""
+        advance = update.sequence - self.sequence
+        if update.sequence < 0:
+            return _Advance.UNNUMBERED
+        if advance == 0:
+            return _Advance.SAME
+        if advance > 0:
+            return _Advance.NEXT if advance <= _LATE_FRAMES else _Advance.LATER
+        return _Advance.EARLIER if advance >= -_LATE_FRAMES else _Advance.FAR_EARLIER
 
 
 @dataclass
@@ -91,6 +116,14 @@ _BundleKind: TypeAlias = tuple[Peer, bytes, bool, bool]
 """Sender, its name, and whether a bundle has cursors and blobs."""
 
 
+class _IdentifiedTouch(NamedTuple):
+    """A touch with the id of its contact."""
+
+    touch: Touch
+    keys: tuple[_Key, ...] = ()
+    """Of its cursor and blob, for a sender of blobs."""
+
+
 @dataclass
 class _Sender:
     """State of a sender."""
@@ -102,17 +135,29 @@ class _Sender:
     ids: dict[_Key, int] = field(default_factory=dict)  # of its contacts, if it sends blobs
     resting: int = 0  # consecutive frames without contacts
 
+    def has_paused(self, now: float) -> bool:
+        """Whether it has been silent for so long that it may have been restarted."""
+        return now - self.last_heard >= RESTART_PAUSE
+
     def continues_with(self, bundle: _Bundle) -> bool:
         """Whether the frame numbers of a bundle, if any, follow the latest ones."""
-        for address, profile in bundle.profiles.items():
-            last_profile = self.profiles.get(address)
-            if profile.sequence >= 0 and last_profile is not None:
-                advance = profile.sequence - last_profile.sequence
-                if not 0 < advance <= _LATE_FRAMES:
+        for address, update in bundle.profiles.items():
+            profile = self.profiles.get(address)
+            if profile is not None:
+                advance = profile.advance_to(update)
+                if advance not in (_Advance.UNNUMBERED, _Advance.NEXT):
                     return False
         return True
 
-    def touches(self, *, since: float) -> tuple[Touch, ...]:
+    def take(self, changed: Mapping[str, _Profile], peer: Peer, now: float) -> None:
+        """Store the profiles that a bundle from a peer has changed."""
+        self.profiles |= changed
+        self.last_heard = now
+        if self.peer != peer:
+            self.former = self.peer
+            self.peer = peer
+
+    def contacts(self, *, since: float) -> list[_IdentifiedTouch]:
         """Return the contacts of profiles received since a time [s].
 
         A contact that is both a cursor and a blob is a cursor with the blob's size, and keeps its
@@ -124,23 +169,27 @@ class _Sender:
                 for number, touch in profile.touches.items():
                     received[address, number] = touch
         if BLOBS not in self.profiles:
-            return tuple(received.values())
-        former_ids = self.ids
-        self.ids = {}
-        touches: dict[int, Touch] = {}
-        blobs = _blobs_of_cursors(received, former_ids)
+            return [_IdentifiedTouch(touch) for touch in received.values()]
+        blobs = _blobs_of_cursors(received, self.ids)
         unpaired = [key for key in received if key not in blobs.values()]
-        unpaired.sort(key=lambda key: key not in former_ids)
+        unpaired.sort(key=lambda key: key not in self.ids)
+        contacts: dict[int, _IdentifiedTouch] = {}
         for key in unpaired:
             blob_key = blobs.get(key, key)
             touch = received[key]
-            id = former_ids.get(key, former_ids.get(blob_key, touch.id))
-            while id in touches:
+            id = self.ids.get(key, self.ids.get(blob_key, touch.id))
+            while id in contacts:
                 id += _APART_IDS
-            self.ids[key] = id
-            self.ids[blob_key] = id
-            touches[id] = replace(touch, id=id, size=received[blob_key].size)
-        return tuple(touches.values())
+            joined = replace(touch, id=id, size=received[blob_key].size)
+            contacts[id] = _IdentifiedTouch(joined, (key, blob_key))
+        return list(contacts.values())
+
+    def remember(self, contacts: Sequence[_IdentifiedTouch]) -> None:
+        """Remember the ids of the contacts in a frame, and whether there are any."""
+        self.ids = {}
+        for contact in contacts:
+            self.ids |= dict.fromkeys(contact.keys, contact.touch.id)
+        self.resting = 0 if contacts else self.resting + 1
 
 
 def _blobs_of_cursors(
@@ -225,13 +274,10 @@ class TuioSource(UdpSource):
                 changed[address] = updated
         if not changed:
             return None
-        sender.profiles |= changed
-        if sender.peer != peer:
-            sender.former = sender.peer
-            sender.peer = peer
-        sender.last_heard = arrived
-        touches = sender.touches(since=arrived - self.timeout)
-        sender.resting = 0 if touches else sender.resting + 1
+        sender.take(changed, peer, arrived)
+        contacts = sender.contacts(since=arrived - self.timeout)
+        sender.remember(contacts)
+        touches = tuple(contact.touch for contact in contacts)
         origin = f"tuio:{peer[0]}:{peer[1]}"
         return TouchFrame(name, arrived, touches, self.timeout, origin=origin)
 
@@ -295,8 +341,8 @@ class TuioSource(UdpSource):
         sender = self._senders.get(name)
         if sender is None or sender.peer == peer:
             return name
-        has_paused = now - sender.last_heard >= RESTART_PAUSE
-        if sender.former != peer and (has_paused or sender.continues_with(bundle)):
+        is_same_program = sender.has_paused(now) or sender.continues_with(bundle)
+        if sender.former != peer and is_same_program:
             return name
         ports = f"ports {sender.peer[1]} and {port}"
         self.rejects.count("same_name", f"{name} comes from {ports}; rename one of the programs")
@@ -324,7 +370,7 @@ class TuioSource(UdpSource):
             return min(names, key=lambda name: self._senders[name].last_heard)
 
         idle = oldest(self._senders)
-        if now - self._senders[idle].last_heard >= RESTART_PAUSE:
+        if self._senders[idle].has_paused(now):
             return idle
         counts = Counter(sender.peer for sender in self._senders.values())
         ((busiest, count),) = counts.most_common(1)
@@ -340,19 +386,18 @@ class TuioSource(UdpSource):
         Bundles without a number and redundant bundles (-1) are never late; a frame split over
         several bundles repeats its number.
         """
-        last_sequence = profile.sequence
-        last_numbered_at = profile.numbered_at
+        sequence = profile.sequence
+        numbered_at = profile.numbered_at
         if update.sequence >= 0:
-            has_paused = now - last_numbered_at >= RESTART_PAUSE
-            drop = last_sequence - update.sequence
-            if 0 < drop <= _LATE_FRAMES and not has_paused:
-                detail = f"frame {update.sequence} of {name} after {last_sequence}"
+            sequence = update.sequence
+            numbered_at = now
+        match profile.advance_to(update):
+            case _Advance.EARLIER if now - profile.numbered_at < RESTART_PAUSE:
+                detail = f"frame {update.sequence} of {name} after {profile.sequence}"
                 self.rejects.count("late", detail)
                 return None
-            if drop > 0:
+            case _Advance.EARLIER | _Advance.FAR_EARLIER:
                 profile = _Profile()  # the sender was restarted
-            last_sequence = update.sequence
-            last_numbered_at = now
         alive = profile.alive
         if update.alive is not None:
             alive = tuple(dict.fromkeys(update.alive))
@@ -361,7 +406,7 @@ class TuioSource(UdpSource):
         if alive is not None:
             ids = [id for id in alive if id in touches]
         active_touches = {id: touches[id] for id in islice(ids, _MAX_MESSAGES)}
-        return _Profile(alive, active_touches, last_sequence, last_numbered_at, now)
+        return _Profile(alive, active_touches, sequence, numbered_at, now)
 
 
 def _kind_of(datagram: Datagram) -> _BundleKind:

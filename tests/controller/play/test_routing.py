@@ -210,7 +210,7 @@ async def test_contents_leave_a_clock_that_is_lost(
         await fingers.hold(1.0)
         assert shared(fingers)
         if is_changing:
-            fingers.controller.cycle.tracker.changed = _Changing()
+            fingers.controller.cycle.tracker._changed = _Changing()
         known["b"] = math.inf
         await fingers.hold(0.2 if is_changing else 0.1)
         assert not shared(fingers)

@@ -9,7 +9,7 @@ from controller.effects.click_turns import ClickTurns
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
 from controller.effects.layout import SurfaceLayout
 from controller.effects.strengths import Strengths
-from controller.play.intent import NO_CONTACTS, Band, Gains, HapticIntent, Target
+from controller.play.intent import NO_CONTACTS, Gains, HapticIntent, Target
 from controller.sources.touch import Contact, ContactKey
 from registry.plugins import WrongResultError
 
@@ -18,7 +18,7 @@ from registry.plugins import WrongResultError
 _NOISE = 0.001
 
 REQUESTED_PRIORITY = 1_000_000
-"""Priority of an effect requested by name, above all regions."""
+"""Priority of requested effects, above all regions, whose priority is at most 100."""
 
 CLICK_ABOVE_DB = 6.0
 """Default level [dB] of a short pulse above a continuous effect at its finger."""
@@ -35,17 +35,22 @@ class _Play:
     effect: Effect
     run: EffectRun
     number: int  # in order of start
-    priority: int
-    band: Band | None
-    region: Region | None
-    is_elsewhere: bool  # whether it is the effect outside all regions
+    region: Region | None  # None: outside all regions
     above_db: float | None  # see `Target`
+    is_requested: bool = False  # whether a client requested it by name
     player: str | None = None  # client that requested it
 
     @property
-    def is_requested(self) -> bool:
-        """Whether it was requested by name."""
-        return self.priority == REQUESTED_PRIORITY
+    def priority(self) -> int:
+        """Priority of its target; see `Target`."""
+        if self.is_requested:
+            return REQUESTED_PRIORITY
+        return 0 if self.region is None else self.region.priority
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether it is the layout's effect outside all regions."""
+        return self.region is None and not self.is_requested
 
     @property
     def outlasts_its_layout(self) -> bool:
@@ -214,17 +219,17 @@ class EffectPlayer:
         finger.plays = [
             play for play in finger.plays if not (play.is_requested and play.name == name)
         ]
-        play = self._play(
-            finger.region,
+        run = _run_of(effect, finger.region, contact, now, level_db_sl=level_db_sl)
+        play = _Play(
             name,
             effect,
-            contact,
-            now,
-            level_db_sl=level_db_sl,
-            priority=REQUESTED_PRIORITY,
+            run,
+            number=self._next_number(),
+            region=finger.region,
+            above_db=None if has_level else CLICK_ABOVE_DB,
+            is_requested=True,
+            player=player,
         )
-        play.above_db = None if has_level else CLICK_ABOVE_DB
-        play.player = player
         finger.plays.append(play)
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
@@ -282,40 +287,11 @@ class EffectPlayer:
         self, finger: _Finger, region: Region | None, name: str, contact: Contact, now: float
     ) -> None:
         """Start an effect of a region, or the effect outside all."""
-        level_db_sl = self.layout.level_of(name, region)
-        priority = 0 if region is None else region.priority
         effect = self.layout.effects[name]
-        play = self._play(
-            region, name, effect, contact, now, level_db_sl=level_db_sl, priority=priority
-        )
-        finger.plays.append(play)
-
-    def _play(
-        self,
-        region: Region | None,
-        name: str,
-        effect: Effect,
-        contact: Contact,
-        now: float,
-        *,
-        level_db_sl: float | None,
-        priority: int,
-    ) -> _Play:
-        """Start a run of an effect in a region, or outside all."""
-        run = effect.start_in(region, contact, now, level_db_sl=level_db_sl)
-        if not isinstance(run, EffectRun):
-            raise WrongResultError(effect, run, EffectRun)
-        return _Play(
-            name,
-            effect,
-            run,
-            self._next_number(),
-            priority,
-            effect.band_in(region),
-            region,
-            is_elsewhere=region is None and priority != REQUESTED_PRIORITY,
-            above_db=None if effect.gives_level_in(region) else CLICK_ABOVE_DB,
-        )
+        level_db_sl = self.layout.level_of(name, region)
+        run = _run_of(effect, region, contact, now, level_db_sl=level_db_sl)
+        above_db = None if effect.gives_level_in(region) else CLICK_ABOVE_DB
+        finger.plays.append(_Play(name, effect, run, self._next_number(), region, above_db))
 
     def _next_number(self) -> int:
         self._play_count += 1
@@ -333,6 +309,21 @@ class EffectPlayer:
             felt_plays += _felt_by(self._fingers[contact.key], contact, now, changes)
         felt_plays.sort(key=_number_of)
         return felt_plays
+
+
+def _run_of(
+    effect: Effect,
+    region: Region | None,
+    contact: Contact,
+    now: float,
+    *,
+    level_db_sl: float | None,
+) -> EffectRun:
+    """Start a run of an effect in a region, or outside all; check the result of a plug-in."""
+    run = effect.start_in(region, contact, now, level_db_sl=level_db_sl)
+    if not isinstance(run, EffectRun):
+        raise WrongResultError(effect, run, EffectRun)
+    return run
 
 
 def _remaining(
@@ -392,7 +383,7 @@ def _target(felt: _FeltPlay, *, is_alone: bool) -> Target:
         key,
         play.name,
         play.region,
-        band=play.band,
+        band=play.effect.band_in(play.region),
         priority=play.priority,
         above_db=play.above_db,
     )

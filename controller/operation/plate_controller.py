@@ -10,7 +10,8 @@ from controller.play.planner import Planner
 from controller.play.routing import limits_of, playback_capabilities
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.group import Group, GroupState
+from drivers.host.group import Group
+from drivers.host.group_states import GroupState
 from drivers.host.ledger import UNREACHED, StopOutcome
 from drivers.opening import Lines
 from drivers.protocol.definition import REPLY_TIMEOUT

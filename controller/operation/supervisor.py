@@ -47,7 +47,7 @@ from drivers.errors import (
     WrongAmplifier,
 )
 from drivers.host.amplifier import Amplifier
-from drivers.host.group import GroupState
+from drivers.host.group_states import GroupState
 from drivers.host.ledger import StopOutcome
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
 from drivers.protocol.records import Values
@@ -601,7 +601,7 @@ class Supervisor:
         epoch = self.operation.epoch
         group = self.controller.group
         statuses = await group.statuses()
-        if epoch != self.operation.epoch or group.members.silencing:
+        if epoch != self.operation.epoch or group.members.disarming:
             return  # they may have been read before, or during a ramp
         problem = find_problem(statuses, group.amplifiers)
         match self.operation.state:

@@ -9,7 +9,6 @@ import logging
 import math
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from enum import Enum, auto
 from functools import partial
 from typing import Any, TypeVar
 
@@ -24,8 +23,9 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier, IsPreempted
 from drivers.host.group_clocks import Clocks
+from drivers.host.group_states import REACTIONS, Failure, GroupState
 from drivers.host.heartbeats import Heartbeats
-from drivers.host.joint_sets import JointSets, PlayedSet
+from drivers.host.joint_sets import JointSets, PlayedSet, UnplayedSet
 from drivers.host.ledger import StopOutcome
 from drivers.host.line import Priority
 from drivers.host.members import Members, is_lost, outcomes
@@ -38,19 +38,6 @@ _T = TypeVar("_T")
 _SESSION = QUANTITIES["session"]
 _TOKEN = QUANTITIES["token"]
 _logger = logging.getLogger(__name__)
-
-
-class GroupState(Enum):
-    """State of all amplifiers together."""
-
-    CLOSED = auto()
-    """Not opened yet, or closed again."""
-    DISARMED = auto()
-    STOPPED = auto()
-    """Disarmed by a stop, which must be cleared before they can be armed."""
-    ARMED = auto()
-    LOST = auto()
-    """A LinkError has shown that an amplifier is lost."""
 
 
 class Group:
@@ -76,7 +63,7 @@ class Group:
         self.amplifiers = self.members.amplifiers
         self.sets = JointSets(self.members, draw(_TOKEN.minimum, _TOKEN.maximum))
         """Makes them play together."""
-        self._clocks = Clocks(self.members)
+        self._clocks = Clocks(self.members, self.sets)
         self._heartbeats = Heartbeats(self.members, self.sets, self._clocks, restored)
         self._watchdog = watchdog
         self.draw = draw
@@ -140,13 +127,13 @@ class Group:
                     return
                 self._leave_armed()
                 epoch = members.epoch
-                await members.start_silencing(self._disarm, amplifiers, STOP_RAMP)
+                await members.start_disarming(self._disarm, amplifiers, STOP_RAMP)
                 members.check_none_since(epoch)
             for amplifier in amplifiers:
                 # If this came later, the disarm after a failure would end another host's vibration.
                 amplifier.check_other_host()
             await self._arm_all(amplifiers, epoch)
-            self.sets.is_incomplete = False
+            self.sets.note_armed()
             self.state = GroupState.ARMED
 
     def _check_may_arm(self) -> None:
@@ -158,7 +145,7 @@ class Group:
             )
         if self.state is GroupState.STOPPED:  # a restarted amplifier has lost its latch
             raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-        if self.members.silencing:  # otherwise the order of frames would decide the result
+        if self.members.disarming:  # otherwise the order of frames would decide the result
             raise CommandRefused(
                 "amplifiers are being stopped or disarmed; arm again if that is still wanted"
             )
@@ -178,15 +165,14 @@ class Group:
             members.checked(await asyncio.shield(arming))
             members.check_none_since(epoch)
         except BaseException as error:
-            await members.start_silencing(self._disarm_armed, arming)
+            await members.start_disarming(self._disarm_armed, arming)
             if isinstance(error, DriverError):
                 members.check_none_since(epoch)
             # Only now: an amplifier that replied to the disarm is not lost.
-            self._lose_if_shown_by(error)
             if members.is_degraded_only(error):
                 raise LinkDegraded(str(error)) from error
-            if members.lost_by:
-                self._lose()
+            if members.lost_by or isinstance(error, LinkError):
+                self._lose(error)
             raise
 
     async def _disarm_armed(self, arming: "asyncio.Future[Any]") -> None:
@@ -210,11 +196,11 @@ class Group:
         """
         return self._exchange(self._heartbeats.beat)
 
-    def apply(
+    async def apply(
         self,
         layers: Mapping[str, Sequence[AmplifierLayer]],
         is_preempted: IsPreempted | None = None,
-    ) -> Coroutine[Any, Any, PlayedSet]:
+    ) -> PlayedSet:
         """Play layers on the amplifiers with these names; all start at one moment.
 
         If one amplifier refuses its set, none commits, and CommandRefused is raised; a set that
@@ -225,7 +211,10 @@ class Group:
         is_preempted: called before a set is sent, and again before it is committed; if it returns
         True, Overtaken is raised and the current playback continues.
         """
-        return self._exchange(partial(self.sets.play, layers, is_preempted))
+        outcome = await self._exchange(partial(self.sets.play, layers, is_preempted))
+        if isinstance(outcome, UnplayedSet):
+            raise await self._react(outcome.failure, outcome.reason)
+        return outcome
 
     async def silence(self, ramp: float) -> float:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
@@ -243,43 +232,60 @@ class Group:
         if self._limit is not None and not self._limit.expired():
             self._limit.reschedule(threads.now())
 
-    async def _exchange(self, exchange: Callable[[], Awaitable[_T | DriverError]]) -> _T:
-        """Run an exchange of the control loop; an unexplained failure stops all amplifiers.
-
-        An error that the exchange returns, in place of raising it, stops none.
-        """
+    async def _exchange(self, exchange: Callable[[], Awaitable[_T]]) -> _T:
+        """Run an exchange of the control loop; react to an error, then raise it."""
         if not self.is_armed:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
-        members = self.members
-        epoch = members.epoch
+        epoch = self.members.epoch
         limit = asyncio.timeout(None)
         try:
             try:
                 async with limit as self._limit:
-                    done = await exchange()
+                    return await exchange()
             finally:
                 self._limit = None
         except Exception as error:
-            self._lose_if_shown_by(error)
-            has_lost = isinstance(error, LinkTimeout) and self.state is GroupState.LOST
-            # A LinkTimeout is a TimeoutError too: an amplifier that did not reply in time to an
-            # aborted exchange, but is not lost, stops nothing, because silence is sent next.
-            if limit.expired() and isinstance(error, TimeoutError | Preempted) and not has_lost:
-                raise Preempted("given up, since silence comes first") from error
-            if members.is_degraded_only(error):
-                raise LinkDegraded(str(error)) from error
-            is_explained = members.epoch != epoch and self.state is not GroupState.LOST
-            if is_explained and isinstance(error, DriverError):
-                raise Preempted("a stop or disarm came first") from error
+            failure = self._failure_of(error, epoch, is_aborted=limit.expired())
+            reported_error = await self._react(failure, error)
+            if reported_error is error:
+                raise
+            raise reported_error from error
+
+    def _failure_of(self, error: Exception, epoch: int, *, is_aborted: bool) -> Failure:
+        """Classify the error of an exchange that began in an epoch.
+
+        is_aborted: whether `abort_exchange` has ended it.
+        """
+        is_degraded = self.members.is_degraded_only(error)
+        is_link_error = isinstance(error, LinkError)
+        if is_link_error and not is_degraded and self.state is not GroupState.CLOSED:
+            return Failure.LOST
+        # A LinkTimeout is a TimeoutError too: an amplifier that did not reply in time to an aborted
+        # exchange, but is not lost, stops nothing, because silence is sent next.
+        if is_aborted and isinstance(error, TimeoutError | Preempted):
+            return Failure.ABORTED
+        if is_degraded:
+            return Failure.DEGRADED
+        has_new_epoch = self.members.epoch != epoch and self.state is not GroupState.LOST
+        if has_new_epoch and isinstance(error, DriverError):
+            return Failure.PREEMPTED
+        return Failure.FAULT
+
+    async def _react(self, failure: Failure, error: Exception) -> Exception:
+        """React to a failure as `REACTIONS` demands; return the error to be raised."""
+        reaction = REACTIONS[failure]
+        if reaction.state is GroupState.LOST:
+            self._lose(error)
+        if reaction.stops:
             amplifiers = self.amplifiers
             replying = [name for name in amplifiers if not amplifiers[name].no_reply_cause]
             await self.stop(waits_for=replying)
-            if has_lost:  # even if the amplifier was only degraded when the exchange began
-                raise LinkTimeout(next(iter(members.lost_by.values()), str(error))) from error
-            raise
-        if isinstance(done, DriverError):
-            raise done
-        return done
+        if failure is Failure.LOST and isinstance(error, LinkTimeout):
+            # The error may be LinkDegraded, if the amplifier was not lost yet when it was raised.
+            return LinkTimeout(next(iter(self.members.lost_by.values()), str(error)))
+        if reaction.error is None:
+            return error
+        return reaction.error(reaction.message or str(error))
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp to silence [s] and switch the high voltage off, confirmed by every amplifier.
@@ -287,7 +293,7 @@ class Group:
         It runs to completion if its caller is cancelled. If one amplifier fails, all are stopped.
         """
         self._leave_armed()
-        await self.members.start_silencing(self._disarm, [*self.amplifiers.values()], ramp)
+        await self.members.start_disarming(self._disarm, [*self.amplifiers.values()], ramp)
 
     async def _disarm(self, amplifiers: Sequence[Amplifier], ramp: float) -> None:
         retried = self.members.retried
@@ -326,14 +332,14 @@ class Group:
                 stops[name] = asyncio.get_running_loop().create_future()
                 stops[name].set_exception(error)
         names = stops if waits_for is None else waits_for
-        return members.start_silencing(members.stopped, {name: stops[name] for name in names})
+        return members.start_disarming(members.stopped, {name: stops[name] for name in names})
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults that no longer exist.
 
         Raises Preempted while amplifiers are being stopped or disarmed.
         """
-        if self.members.silencing:
+        if self.members.disarming:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
         epoch = self.members.epoch
         try:
@@ -379,38 +385,35 @@ class Group:
                     amplifiers.append(amplifier)
             try:
                 if amplifiers:
-                    await self.members.start_silencing(self._disarm, amplifiers, ramp)
+                    await self.members.start_disarming(self._disarm, amplifiers, ramp)
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
-            if self.members.silencing:  # no line may be closed before that has ended
-                await asyncio.wait({*self.members.silencing})
+            if self.members.disarming:  # no line may be closed before that has ended
+                await asyncio.wait({*self.members.disarming})
 
     def _leave_armed(self) -> None:
         """Change from ARMED to DISARMED, so that nothing more is played."""
-        self.members.epoch += 1
+        self.members.start_epoch()
         if self.is_armed:
             self.state = GroupState.DISARMED
 
-    def _lose(self) -> None:
-        """Enter the state LOST, which plays nothing."""
+    def _lose(self, error: BaseException) -> None:
+        """Enter the state LOST, which plays nothing; name all lost amplifiers in a LinkError."""
+        if isinstance(error, LinkError):
+            error.lost = tuple(self.members.lost_by)
         if self.state is not GroupState.CLOSED:
             self.state = GroupState.LOST
 
-    def _lose_if_shown_by(self, error: BaseException) -> None:
-        """Enter the state LOST if an error shows that an amplifier is lost.
-
-        The error then gets the names of all lost amplifiers.
-        """
-        if isinstance(error, LinkError) and not self.members.is_degraded_only(error):
-            error.lost = tuple(self.members.lost_by)
-            self._lose()
-
     async def _all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
-        """Await all requests to their ends, then raise the most severe error; it may enter LOST."""
+        """Await all requests to their ends, then raise the most severe error.
+
+        An error that shows the loss of an amplifier leads to the state LOST.
+        """
         try:
             return await self.members.all(requests)
         except LinkError as error:
-            self._lose_if_shown_by(error)
+            if not self.members.is_degraded_only(error):
+                self._lose(error)
             raise
 
 

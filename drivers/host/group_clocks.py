@@ -17,6 +17,7 @@ from typing import Any
 from drivers.errors import DriverError
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import HeldClock
+from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line, Priority
 from drivers.host.members import Members
 from drivers.protocol.definition import HEARTBEAT, has_feature
@@ -24,7 +25,7 @@ from drivers.protocol.definition import HEARTBEAT, has_feature
 # Errors of a clock [s]: a good clock does not lower a promise, a fair one by a tenth of a dB.
 _GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6
 _MAX_LOAD = 0.2  # share of the line's time for readings between heartbeats
-_INTERVAL = 0.01  # s; between readings of a fair clock; half for a poor one, more for a better
+_FAIR_INTERVAL = 0.01  # s; between readings of a fair clock; half of it for a poor one
 _SETTLING = 0.2  # s; at most, for readings before clocks are needed
 _FRAME = 1e-3  # s; a USB frame; readings should cover all of its phases
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples cover a circle evenly
@@ -33,8 +34,9 @@ _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples cover a circle evenly
 class Clocks:
     """The clocks of the amplifiers of a group, on open lines."""
 
-    def __init__(self, members: Members) -> None:
+    def __init__(self, members: Members, sets: JointSets) -> None:
         self._members = members
+        self._sets = sets
         self._amplifiers = members.amplifiers
         self._are_alike = True
         """Whether all amplifiers and lines are alike."""
@@ -166,7 +168,7 @@ class Clocks:
             if line in self._marked:
                 self._compare(line_amplifiers, now)
                 # A Mark that waits for a reply would be sent in step with USB frames.
-                delay = self.later(_INTERVAL + _busy_time(line_amplifiers))
+                delay = self.later(_FAIR_INTERVAL + _busy_time(line_amplifiers))
                 loop.call_later(delay, line.submit, None, Priority.HEARTBEAT, "Mark", {})
             else:
                 unmarked[line] = line_amplifiers
@@ -202,7 +204,7 @@ class Clocks:
         reading = self._readings.get(amplifier)
         is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
         is_heard = amplifier.no_reply_cause is None and amplifier.line.loss is None
-        if is_free and is_heard and not self._members.has_joint_set:
+        if is_free and is_heard and not self._sets.is_on_several_lines:
             self._readings[amplifier] = amplifier.read_status(Priority.READING)
 
 
@@ -227,8 +229,8 @@ def _worst_scatter(line_amplifiers: Sequence[Amplifier], now: float) -> float:
 def _reading_interval(scatter: float) -> float:
     """Return the interval between readings of a clock with a scatter above _GOOD [s]."""
     if scatter > _POOR:
-        return _INTERVAL / 2
-    return _INTERVAL * max((_FAIR - _GOOD) / (scatter - _GOOD), 1.0)
+        return _FAIR_INTERVAL / 2
+    return _FAIR_INTERVAL * max((_FAIR - _GOOD) / (scatter - _GOOD), 1.0)
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:

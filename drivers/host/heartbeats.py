@@ -20,7 +20,7 @@ from drivers.host.line import GRACE, Line, Make, Priority
 from drivers.host.members import Members, is_lost
 from drivers.protocol.definition import HEARTBEAT
 from drivers.protocol.records import Values
-from drivers.protocol.sets import is_newer_token, token_after
+from drivers.protocol.sets import is_newer_token
 
 _STATUS_INTERVAL = 0.19  # s; at least, between two statuses that show whether the watchdog runs
 _MAX_STATUS_LOAD = 0.05  # share of the line's time that these statuses may take
@@ -118,9 +118,7 @@ class Heartbeats:
     def _first_token(self, line_amplifiers: Sequence[Amplifier]) -> int:
         """Return the token that an amplifier of a line has committed, or else a new one."""
         committed = max([amplifier.committed for amplifier in line_amplifiers])
-        if not committed:
-            self._sets.token = token_after(self._sets.token)
-        return committed or self._sets.token
+        return committed or self._sets.next_token()
 
     async def _feed_after(
         self, amplifier: Amplifier, epoch: int, awaited: Awaitable[object]

@@ -1,20 +1,27 @@
 """Sets that several amplifiers play together.
 
-A set is staged on all amplifiers that it names, and then committed on all or on none: by one
-broadcast if they share a line, or on several lines for a moment that leaves enough time for the
-slowest line. A set for one amplifier plays with its last part. A token is newer than another one if
-it is ahead by less than half of 2^16 (RFC 1982); so an amplifier left out of 40 000 sets would
-mistake the next one for an old set. It commits an empty set before that.
+`JointSets.play` stages a set on all amplifiers that it names, and then commits it on all or on
+none: by one broadcast if they share a line, or on several lines for a moment that leaves enough
+time for the slowest line. A set for one amplifier plays with its last part.
+
+It returns a `PlayedSet`, or an `UnplayedSet` if no amplifier plays the set. It raises an error only
+if it is unknown which amplifiers play it.
+
+A token is newer than another one if it is ahead by less than half of 2^16 (RFC 1982); so an
+amplifier left out of 40 000 sets would mistake the next one for an old set. It commits an empty set
+before that.
 """
 
 import asyncio
 import math
-from collections.abc import Awaitable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
-from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
+from drivers.errors import CommandRefused, Overtaken, Preempted
 from drivers.host.amplifier import COMMITTING, Amplifier, IsPreempted
+from drivers.host.group_states import Failure
 from drivers.host.ledger import StagedSet, is_silence
 from drivers.host.line import Line, Priority
 from drivers.host.members import Members, last_fed_at, outcomes
@@ -37,11 +44,10 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from registry import threads
 
-INTERVAL = 1 << 12
-"""Number of tokens after which the gaps are checked again."""
-_MAX_GAP = 1 << 14
-_SPAN = 1 << 16
-_STEP = AHEAD_MAX // 2  # between two high words that are tried
+_TOKENS_PER_CHECK = 1 << 12  # number of tokens after which the gaps are checked again
+_MAX_GAP = 1 << 14  # tokens
+_TOKEN_SPAN = 1 << 16
+_WORD_STEP = AHEAD_MAX // 2  # between two high words that are tried
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,19 @@ class PlayedSet:
     """Earliest start [s] of the last amplifier."""
 
 
+@dataclass(frozen=True)
+class UnplayedSet:
+    """A set that no amplifier plays."""
+
+    failure: Failure
+    """REFUSED, OVERTAKEN or SILENCED."""
+    reason: CommandRefused
+
+
+SetOutcome: TypeAlias = PlayedSet | UnplayedSet
+"""What has become of a set, once that is known."""
+
+
 class JointSets:
     """The sets of a group's amplifiers; token: the token before the first set."""
 
@@ -64,6 +83,8 @@ class JointSets:
         """Token of the last set."""
         self.is_incomplete = False
         """Whether perhaps only some amplifiers have committed the last set."""
+        self.is_on_several_lines = False
+        """Whether a set for several lines is under way; no clock is read meanwhile."""
 
     @property
     def is_in_doubt(self) -> bool:
@@ -71,6 +92,15 @@ class JointSets:
         if self.is_incomplete:
             return True
         return any(amplifier.is_in_doubt for amplifier in self._members.amplifiers.values())
+
+    def next_token(self) -> int:
+        """Begin a set, and return its token."""
+        self.token = token_after(self.token)
+        return self.token
+
+    def note_armed(self) -> None:
+        """Note that all amplifiers have just been armed, and so play nothing."""
+        self.is_incomplete = False
 
     def refusal_of(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
@@ -91,122 +121,130 @@ class JointSets:
         self,
         layers: Mapping[str, Sequence[AmplifierLayer]],
         is_preempted: IsPreempted | None = None,
-    ) -> PlayedSet | DriverError:
-        """Stage and commit layers by amplifier; a refusal before the first commit is returned.
+    ) -> SetOutcome:
+        """Play layers on the amplifiers with these names; all start at one moment.
 
-        Preempted is returned if a lost commit is too late to be repeated; all are silent then.
-        Overtaken is returned if the set is preempted before its commit.
+        is_preempted: called before the set is sent, and again before it is committed; if it returns
+        True, the set is given up. Raises DriverError if it is unknown which amplifiers play the
+        set.
         """
-        members = self._members
-        amplifiers = [members.amplifiers[name] for name in layers]
+        amplifiers = [self._members.amplifiers[name] for name in layers]
         amplifiers.sort(key=last_fed_at)
-        members.has_joint_set = len({amplifier.line for amplifier in amplifiers}) > 1
+        lines = {amplifier.line for amplifier in amplifiers}
+        self.is_on_several_lines = len(lines) > 1
         try:
-            return await self._stage_and_commit(amplifiers, layers, is_preempted)
+            return await self._play_on(amplifiers, layers, is_preempted)
         finally:
-            members.has_joint_set = False
+            self.is_on_several_lines = False
 
-    async def _stage_and_commit(
+    async def _play_on(
         self,
         amplifiers: Sequence[Amplifier],
         layers: Mapping[str, Sequence[AmplifierLayer]],
         is_preempted: IsPreempted | None,
-    ) -> PlayedSet | DriverError:
-        """Stage and commit layers as `play` does; amplifiers: in the order of staging."""
+    ) -> SetOutcome:
+        """Stage, judge, commit and report a set; amplifiers: in the order of staging."""
         epoch = self._members.epoch
-        if self.token % INTERVAL == 0:
+        if self.token % _TOKENS_PER_CHECK == 0:
             await self._close_gaps()
-        self.token = token = token_after(self.token)
         is_silent = all(map(is_silence, layers.values()))
-        priority = Priority.SILENCE if is_silent else Priority.SET
-        is_now = is_silent or len(layers) == 1
+        is_immediate = is_silent or len(layers) == 1
         began = threads.now()
+        token = self.next_token()
         stagings = []
         for amplifier in amplifiers:
-            stagings.append(
-                amplifier.stage(
-                    token,
-                    layers[amplifier.name],
-                    now=is_now,
-                    priority=priority,
-                    is_preempted=is_preempted,
-                )
+            staging = amplifier.stage(
+                token,
+                layers[amplifier.name],
+                now=is_immediate,
+                priority=Priority.SILENCE if is_silent else Priority.SET,
+                is_preempted=is_preempted,
             )
-        results = dict(zip(amplifiers, await outcomes(stagings), strict=True))
-        refusals, has_failed = _refusals(results, is_now=is_now)
-        if refusals and not (has_failed or is_silent):
-            refusal = _merged(refusals)
-            return await self._silenced(refusal, amplifiers, began) if is_now else refusal
+            stagings.append(staging)
+        replies = dict(zip(amplifiers, await outcomes(stagings), strict=True))
+        reason = self._judge(replies, is_immediate=is_immediate, is_silent=is_silent)
+        staged_sets = _staged_sets(replies)
+        if reason is None and not is_immediate:
+            if is_preempted is not None and is_preempted():
+                reason = Overtaken(f"set {token} is preempted")
+            else:
+                reason = await self._commit(staged_sets, epoch, began)
+        if reason is not None:
+            return await self._give_up(reason, amplifiers, began)
+        self.is_incomplete = False
+        return await self._report(token, staged_sets)
+
+    def _judge(
+        self,
+        replies: Mapping[Amplifier, StagedSet | BaseException],
+        *,
+        is_immediate: bool,
+        is_silent: bool,
+    ) -> CommandRefused | None:
+        """Return why a set must be given up after staging; None if all amplifiers have staged it.
+
+        is_immediate: whether each amplifier plays it as soon as it arrives. Raises the most severe
+        error of an amplifier that may play the set, or that could not be silenced.
+        """
+        refusals, has_failed = _refusals(replies, is_immediate=is_immediate)
+        if refusals and not has_failed and not is_silent:
+            return _merged(refusals)
+        others = []
+        for amplifier, reply in replies.items():
+            if amplifier.name not in refusals:
+                others.append(reply)
         try:
-            staged = self._staged(results, refusals)
+            self._members.checked(others)  # before refusals, however severe these are
+            self._members.checked([*replies.values()])
         except Overtaken as overtaken:
             return overtaken
-        if is_preempted is not None and not is_now and is_preempted():
-            return Overtaken(f"set {token} is preempted")
-        if not is_now:
-            late_refusal = await self._commit_after_staging(staged, epoch)
-            if late_refusal is not None:
-                return await self._silenced(late_refusal, amplifiers, began)
-        self.is_incomplete = False
-        return await self._played(token, staged)
+        return None
 
-    def _staged(
-        self, results: Mapping[Amplifier, StagedSet | BaseException], refused: Collection[str]
-    ) -> dict[Amplifier, StagedSet]:
-        """Return the staged sets, or raise the failure of an amplifier.
-
-        refused: names of amplifiers whose ledger has refused its set. A worse failure of another
-        amplifier is raised first.
-        """
-        others = [result for amplifier, result in results.items() if amplifier.name not in refused]
-        self._members.checked(others)
-        staged_sets = self._members.checked([*results.values()])
-        return dict(zip(results, staged_sets, strict=True))
-
-    async def _commit_after_staging(
-        self, staged: Mapping[Amplifier, StagedSet], epoch: int
+    async def _commit(
+        self, staged_sets: Mapping[Amplifier, StagedSet], epoch: int, began: float
     ) -> CommandRefused | None:
-        """Commit staged sets; return a refusal that is only due to lateness, raise others.
+        """Commit a set on all amplifiers; return the refusal of a commit that came too late.
 
-        epoch: of the members before staging.
+        epoch, began: of the members, and the time [s], before staging. Raises any other error.
         """
         self._members.check_none_since(epoch)
         self.is_incomplete = True
         try:
-            await self._commit(staged)
+            await self._commit_on_lines(staged_sets)
         except CommandRefused as refusal:
             if refusal.until is None or self._members.epoch != epoch:
                 raise
+            self.is_incomplete = _may_play_since(began, staged_sets)
             return refusal
         return None
 
-    async def _played(self, token: int, staged: Mapping[Amplifier, StagedSet]) -> PlayedSet:
-        """Return the set that was committed, after reading how amplifiers have rounded it."""
-        played = {amplifier.name: staged_set.layers for amplifier, staged_set in staged.items()}
-        starts_at = max([amplifier.played_at for amplifier in staged], default=-math.inf)
+    async def _give_up(
+        self, reason: CommandRefused, amplifiers: Sequence[Amplifier], began: float
+    ) -> UnplayedSet:
+        """Silence a set that came too late, if it may play; return it as unplayed.
+
+        began: start of staging [s].
+        """
+        if isinstance(reason, Overtaken):
+            return UnplayedSet(Failure.OVERTAKEN, reason)
+        if reason.until is None or not _may_play_since(began, amplifiers):
+            return UnplayedSet(Failure.REFUSED, reason)
+        await self.silence(STOP_RAMP)
+        return UnplayedSet(Failure.SILENCED, reason)
+
+    async def _report(self, token: int, staged_sets: Mapping[Amplifier, StagedSet]) -> PlayedSet:
+        """Return a set that all amplifiers play, after reading how they have rounded it."""
+        played: dict[str, tuple[LayerSet, ...]] = {}
         readings: dict[str, Awaitable[tuple[LayerSet, ...]]] = {}
-        for amplifier, staged_set in staged.items():
+        for amplifier, staged_set in staged_sets.items():
+            played[amplifier.name] = staged_set.layers
             if not staged_set.is_exact:
                 readings[amplifier.name] = _achieved(amplifier, staged_set)
+        starts_at = max([amplifier.played_at for amplifier in staged_sets], default=-math.inf)
         if readings:
             achieved = await self._members.all([*readings.values()])
             played.update(zip(readings, achieved, strict=True))
         return PlayedSet(token, played, starts_at)
-
-    async def _silenced(
-        self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
-    ) -> CommandRefused:
-        """Silence a set that came too late, if it may play; returns the error with the reason.
-
-        began: start of sending [s].
-        """
-        if refusal.until is None or not any(
-            amplifier.played_at >= began for amplifier in amplifiers
-        ):
-            self.is_incomplete = False
-            return refusal
-        await self.silence(STOP_RAMP)
-        return Preempted(str(refusal))
 
     async def silence(self, ramp: float) -> None:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
@@ -216,38 +254,35 @@ class JointSets:
         await self._members.all([amplifier.silence(ramp) for amplifier in amplifiers])
         self.is_incomplete = False
 
-    async def _commit(self, staged: Mapping[Amplifier, StagedSet]) -> None:
+    async def _commit_on_lines(self, staged_sets: Mapping[Amplifier, StagedSet]) -> None:
         """Commit on all lines for one moment, by one broadcast for amplifiers that share a line.
 
         Raises CommandRefused if an amplifier does not play its set afterwards.
         """
-        by_line: dict[Line, list[Amplifier]] = {}
-        for amplifier in staged:
-            by_line.setdefault(amplifier.line, []).append(amplifier)
         token = self.token
+        by_line: dict[Line, list[Amplifier]] = {}
+        for amplifier in staged_sets:
+            by_line.setdefault(amplifier.line, []).append(amplifier)
         moment: float | None = None  # None: immediately
         if len(by_line) > 1:
-            await _freed(
-                [*by_line], until=min([staged_set.until for staged_set in staged.values()])
-            )
+            deadline = min([staged_set.until for staged_set in staged_sets.values()])
+            await _wait_until_free([*by_line], until=deadline)
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
-        for amplifier in staged:
+        words = _start_words(moment, [*staged_sets])
+        for amplifier in staged_sets:
             amplifier.set_start(moment)
-        if moment is None:
-            words = dict.fromkeys(staged, word_passed_by_all(threads.now(), [*staged]))
-        else:
-            words = _words_of(moment, [*staged])
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
-        for line, sharing in by_line.items():
-            at = words[sharing[0]]
-            if len(sharing) == 1 or any(words[amplifier] != at for amplifier in sharing):
-                for amplifier in sharing:  # alone on the line, or a clock is not steered
+        for line, line_amplifiers in by_line.items():
+            line_words = {words[amplifier] for amplifier in line_amplifiers}
+            if len(line_amplifiers) == 1 or len(line_words) > 1:  # a clock is not steered
+                for amplifier in line_amplifiers:
                     requests[amplifier] = amplifier.commit(token, words[amplifier])
                 continue
-            make = partial(commit_of, sharing, token, at)
+            make = partial(commit_of, line_amplifiers, token, line_words.pop())
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
-            for amplifier in sharing:  # a heartbeat confirms it, and feeds the watchdog meanwhile
+            for amplifier in line_amplifiers:
+                # A heartbeat confirms the broadcast, and feeds the watchdog meanwhile.
                 requests[amplifier] = amplifier.ping()
         # The broadcasts are awaited too: a queued one is not sent if this is cancelled.
         statuses = await self._members.all([*requests.values(), *broadcasts])
@@ -257,20 +292,37 @@ class JointSets:
 
     async def _close_gaps(self) -> None:
         """Let amplifiers whose token is far behind commit an empty set, which changes nothing."""
-        behind = [
-            amplifier
-            for amplifier in self._members.amplifiers.values()
-            if amplifier.committed > 0 and (self.token - amplifier.committed) % _SPAN > _MAX_GAP
-        ]
-        if behind:  # amplifiers without a committed token accept any token as newer
-            self.token = token_after(self.token)
-            await self._members.all(
-                [amplifier.stage(self.token, (), now=True) for amplifier in behind]
-            )
+        behind = []
+        for amplifier in self._members.amplifiers.values():
+            # An amplifier without a committed token accepts any token as newer.
+            gap = (self.token - amplifier.committed) % _TOKEN_SPAN
+            if amplifier.committed > 0 and gap > _MAX_GAP:
+                behind.append(amplifier)
+        if behind:
+            token = self.next_token()
+            await self._members.all([amplifier.stage(token, (), now=True) for amplifier in behind])
 
 
-def _words_of(moment: float, amplifiers: Sequence[Amplifier]) -> dict[Amplifier, int]:
-    """Return the nearest high word of the clock of each amplifier at a moment [s]."""
+def _staged_sets(
+    replies: Mapping[Amplifier, StagedSet | BaseException],
+) -> dict[Amplifier, StagedSet]:
+    """Return the sets that amplifiers have staged."""
+    staged_sets = {}
+    for amplifier, reply in replies.items():
+        if isinstance(reply, StagedSet):
+            staged_sets[amplifier] = reply
+    return staged_sets
+
+
+def _may_play_since(began: float, amplifiers: Iterable[Amplifier]) -> bool:
+    """Whether an amplifier may have started to play a set since a time [s]."""
+    return any(amplifier.played_at >= began for amplifier in amplifiers)
+
+
+def _start_words(moment: float | None, amplifiers: Sequence[Amplifier]) -> dict[Amplifier, int]:
+    """Return the high word of each amplifier's clock at a moment [s]; None: immediately."""
+    if moment is None:
+        return dict.fromkeys(amplifiers, word_passed_by_all(threads.now(), amplifiers))
     steered_word = high_word(clock_at(moment + HIGH_TIME / 2))
     words = {}
     for amplifier in amplifiers:
@@ -292,10 +344,10 @@ def word_passed_by_all(now: float, amplifiers: Sequence[Amplifier]) -> int:
         if not amplifier.clock.can_be_steered:
             times.append(_shown(amplifier, now))
             times.append(_shown(amplifier, now + COMMITTING))
-    for _ in range(HIGH_WORDS // _STEP):
+    for _ in range(HIGH_WORDS // _WORD_STEP):
         if all(moment_of(at, time) is None for time in times):
             break
-        at = (at - _STEP) % HIGH_WORDS
+        at = (at - _WORD_STEP) % HIGH_WORDS
     return at
 
 
@@ -304,7 +356,7 @@ def _shown(amplifier: Amplifier, time: float) -> float:
     return time + amplifier.clock.lead(time) + HIGH_TIME / 2
 
 
-async def _freed(lines: Sequence[Line], *, until: float) -> None:
+async def _wait_until_free(lines: Sequence[Line], *, until: float) -> None:
     """Wait until a commit can be sent on all lines simultaneously, or until a time [s]."""
     while threads.now() < until:
         busy = [line.current.result for line in lines if line.current is not None]
@@ -314,22 +366,22 @@ async def _freed(lines: Sequence[Line], *, until: float) -> None:
 
 
 def _refusals(
-    results: Mapping[Amplifier, StagedSet | BaseException], *, is_now: bool
+    replies: Mapping[Amplifier, StagedSet | BaseException], *, is_immediate: bool
 ) -> tuple[dict[str, CommandRefused], bool]:
     """Return the ledgers' refusals of a set by amplifier, and whether it has failed otherwise.
 
-    is_now: whether the set plays as soon as it arrives, so that an amplifier may play it although
-    it has refused it.
+    is_immediate: whether the set plays as soon as it arrives, so that an amplifier may play it
+    although it has refused it.
     """
     refusals = {}
     has_failed = False
-    for amplifier, result in results.items():
-        if isinstance(result, CommandRefused) and not result.is_disarmed:
-            if is_now and result.may_play:
+    for amplifier, reply in replies.items():
+        if isinstance(reply, CommandRefused) and not reply.is_disarmed:
+            if is_immediate and reply.may_play:
                 has_failed = True
-            elif not isinstance(result, Preempted):
-                refusals[amplifier.name] = result
-        elif isinstance(result, BaseException):
+            elif not isinstance(reply, Preempted):
+                refusals[amplifier.name] = reply
+        elif isinstance(reply, BaseException):
             has_failed = True
     return refusals, has_failed
 

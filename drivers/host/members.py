@@ -28,15 +28,10 @@ class Members:
         self.amplifiers = dict(amplifiers)
         self.epoch = 0
         """Number of stops, disarms and closes; what began before one must not arm, play or feed."""
-        self.has_joint_set = False
-        """Whether a set for several lines is under way; no clock is read meanwhile.
-
-        Only `JointSets.play` changes it.
-        """
         self.gives_up_at = math.inf
         """When requests are no longer repeated [s], because all is being closed."""
-        self.silencing: set[asyncio.Future[Any]] = set()
-        """Stops and disarms in progress."""
+        self.disarming: set[asyncio.Future[Any]] = set()
+        """Stops and disarms in progress; each leaves its amplifiers disarmed."""
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # the last stop of each line
 
     @property
@@ -79,6 +74,10 @@ class Members:
         """When a set or silence was last sent to any amplifier [s]."""
         times = [amplifier.played_at for amplifier in self.amplifiers.values()]
         return max(times, default=-math.inf)
+
+    def start_epoch(self) -> None:
+        """Note a stop, disarm or close: what began before must not arm, play or feed."""
+        self.epoch += 1
 
     def check_none_since(self, epoch: int) -> None:
         """Raise Preempted if a stop, disarm or close has come since an epoch."""
@@ -123,13 +122,13 @@ class Members:
                     raise
                 await asyncio.sleep(_REPEAT_INTERVAL)
 
-    def start_silencing(
+    def start_disarming(
         self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
     ) -> Coroutine[Any, Any, _T]:
         """Start a stop or disarm, which runs to completion in spite of cancellation."""
         task = asyncio.ensure_future(work(*args, **kwargs))  # starts even if not awaited
-        self.silencing.add(task)
-        task.add_done_callback(self.silencing.discard)
+        self.disarming.add(task)
+        task.add_done_callback(self.disarming.discard)
         return _to_completion(task)
 
     def broadcast_stop(self, line: Line, ramp: float) -> None:
@@ -171,15 +170,7 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
 
 async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException]:
     """Await all requests to their ends; returns the result or the error of each."""
-    if len(requests) > 1:
-        return await asyncio.gather(*requests, return_exceptions=True)
-    results = list[_T | BaseException]()
-    for request in requests:  # `gather` would take a further iteration of the event loop
-        try:
-            results.append(await request)
-        except Exception as error:
-            results.append(error)
-    return results
+    return await asyncio.gather(*requests, return_exceptions=True)
 
 
 def last_fed_at(amplifier: Amplifier) -> float:

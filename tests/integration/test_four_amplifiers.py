@@ -45,7 +45,7 @@ from controller.gateway.app import MAX_SESSIONS
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
-from drivers.host.group import GroupState
+from drivers.host.group_states import GroupState
 from era_haptics.command import run_era
 from era_haptics.lab.conformance.contract import opened
 from kit.chain import Chain

@@ -42,7 +42,7 @@ from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Selector
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Change, Contact, ContactKey, Touch, TouchFrame
-from drivers.host.group import GroupState
+from drivers.host.group_states import GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values

@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --editable
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants rename-test kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
-	bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
+	bench-promise dist kernels smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -192,16 +192,12 @@ docs: .venv/installed-docs
 	! grep -rlE --include='*.html' '<(script|link|img|iframe)[^>]+(src|href)="(https?:)?//' docs/_build/html
 	@echo "Next: open docs/_build/html/index.html"
 
-# The same bytes for the same sources, wherever and whenever; from a clean checkout.
+# The sdist, and a wheel for machines like this one with the compiled C libraries; without a C compiler, a
+# wheel for any machine. The same compiler makes the same bytes of the same sources; from a clean checkout.
 dist: .venv/installed-release
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/twine check --strict dist/*
-
-# A wheel with the compiled engine of `era soft-amp`, for machines like this one without a compiler.
-dist-platform: .venv/installed-release
-	ERA_HAPTICS_ENGINE=1 $(BIN)/python -m build --wheel --outdir dist .
-	$(BIN)/twine check --strict dist/*.whl
 
 # The wheel alone, in a clean environment for each of python3.11 to python3.14 that is found.
 # Others: make smoke SMOKE='--python /path/to/python3.13'
@@ -227,6 +223,7 @@ licences: sbom
 	$(BIN)/python tests/support/licences.py dist/sbom.json dist/sbom-extras.json > docs/reference/licences.md
 
 clean:
+	rm -rf model/compiled/*.so sim/soft_amp/*.so
 	rm -rf .venv dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
 
 # A half-made environment is taken away, or the next run would take it for a whole one.
@@ -238,13 +235,17 @@ $(BIN)/python:
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; \
 		echo "No environment could be made; Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 
-.venv/installed: $(BIN)/python pyproject.toml
+# The C libraries for this processor, if their sources have changed; without a C compiler, numpy computes.
+kernels: $(BIN)/python
+	@$(BIN)/python build_libraries.py
+
+.venv/installed: $(BIN)/python pyproject.toml | kernels
 	@echo "Installing era-haptics and 36 packages into .venv: 81 MB of downloads, 382 MB on disk,"
 	@echo "about a minute besides the downloads. Nothing outside .venv is changed."
 	$(PIP) .
 	touch $@
 
-.venv/installed-test: $(BIN)/python pyproject.toml
+.venv/installed-test: $(BIN)/python pyproject.toml | kernels
 	@echo "Installing era-haptics and the test tools into .venv: 790 MB on disk, some minutes."
 	$(PIP) '.[test]'
 	touch $@ .venv/installed
@@ -253,14 +254,14 @@ $(BIN)/python:
 	$(PIP) '.[test,qt]'
 	touch $@
 
-.venv/installed-docs: $(BIN)/python pyproject.toml
+.venv/installed-docs: $(BIN)/python pyproject.toml | kernels
 	$(PIP) '.[docs]'
 	touch $@ .venv/installed
 
-.venv/installed-release: $(BIN)/python pyproject.toml
+.venv/installed-release: $(BIN)/python pyproject.toml | kernels
 	$(PIP) '.[release]'
 	touch $@ .venv/installed
 
-.venv/installed-peers: $(BIN)/python pyproject.toml
+.venv/installed-peers: $(BIN)/python pyproject.toml | kernels
 	$(PIP) '.[peers]'
 	touch $@ .venv/installed

@@ -1,4 +1,4 @@
-"""The cache folder of tables and compiled kernels, and the versions that results carry."""
+"""The cache folder of tables, and the versions that results carry."""
 
 import hashlib
 from functools import cache

@@ -6,6 +6,7 @@ import os
 import random
 import signal
 from collections.abc import Generator, Iterator
+from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
+from build_libraries import BuildError, tree_libraries, update  # noqa: E402
 from cases import COLLECTED, SLOWEST  # noqa: E402
 from kit.plates import make_paper_rig  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
@@ -49,6 +51,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--in-order", action="store_true", help="run files in the order in which they are named"
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the C libraries whose sources have changed; without a compiler, numpy is tested."""
+    is_worker = hasattr(config, "workerinput")
+    if not is_worker:
+        with suppress(BuildError):
+            update(tree_libraries())
 
 
 @pytest.hookimpl(optionalhook=True)

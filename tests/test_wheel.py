@@ -1,10 +1,13 @@
 """What is built to be installed: the same every time, complete, nothing besides, and it works.
 
-Also from a rig to a design where Python has nothing of POSIX: a process like on Windows.
+With the C libraries, and without a compiler. Also from a rig to a design where Python has nothing
+of POSIX: a process like on Windows.
 """
 
+import ctypes
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -15,13 +18,16 @@ from pathlib import Path
 import pytest
 from packaging.tags import platform_tags
 
+from build_libraries import BuildError, Library, compile_library, tree_libraries, update
 from cases import shortly
 from licences import NOTES
-from model.compiled.kernels import versions
+from model.compiled.kernels import WITHOUT_KERNELS
+from model.compiled.versions import versions
 from packages import PACKAGES
 from smoke import lowest, requirements
 
 ROOT = Path(__file__).parents[1]
+LATER = 4_000_000_000  # s; a time of change after those of all files of the project
 
 # Of the sources: what is neither a program nor made by one.
 DATA = re.compile(
@@ -39,8 +45,14 @@ def build(target: str, root: Path, folder: Path, **environment: str) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from the checkout."""
-    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+    """Built from the checkout, without a C compiler."""
+    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"), CC="no-such-compiler")
+
+
+@pytest.fixture(scope="module")
+def platform_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from the checkout, with the C libraries."""
+    return build("wheel", ROOT, tmp_path_factory.mktemp("platform"))
 
 
 @pytest.fixture(scope="module")
@@ -50,27 +62,23 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
-    """Every module, page and data file of the packages, what examples lend, and nothing else."""
+    """Every module, page and data file of the packages, what examples lend, and nothing else.
+
+    Without a compiler, its tag is for every platform.
+    """
+    assert wheel.stem.endswith("-py3-none-any")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     made = {name for name in names if ".dist-info/" in name}
     recordings = {
         f"controller/data/{name}.tuio" for name in ("touches", "two_people", "three_people")
     }
-    lent = (
-        recordings
-        | {"model/data/paper_plate.yaml"}
-        | {
-            f"sim/soft_amp/{path.relative_to(ROOT).as_posix()}"
-            for folder in ("core", "wire", "ports/sound")
-            for path in (ROOT / "firmware" / folder).iterdir()
-        }
-    )
+    lent = recordings | {"model/data/paper_plate.yaml"}
     sources = {
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES
         for path in (ROOT / package).rglob("*.*")
-        if "__pycache__" not in path.parts
+        if "__pycache__" not in path.parts and path.suffix != ".so"
     }
     assert names - made == sources | lent
     assert [name for name in sources if not DATA.search(name)] == []
@@ -110,25 +118,26 @@ def test_entry_points_lead_into_the_wheel(wheel: Path) -> None:
 
 
 @pytest.mark.long
-def test_sdist_makes_the_same_wheel(wheel: Path, sdist: Path, tmp_path: Path) -> None:
-    """Byte for byte, so a distribution's build equals the published one."""
+def test_sdist_makes_the_same_wheel(platform_wheel: Path, sdist: Path, tmp_path: Path) -> None:
+    """Byte for byte, with the same compiler, so a distribution's build equals the published one."""
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path, filter="data")
     root = next(tmp_path.iterdir())
     again = build("wheel", root, tmp_path / "again")
-    assert again.name == wheel.name
-    assert again.read_bytes() == wheel.read_bytes()
+    assert again.name == platform_wheel.name
+    assert again.read_bytes() == platform_wheel.read_bytes()
 
 
 @pytest.mark.long
-def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> None:
-    """It is tagged for the platform; its engine is loaded where there is no compiler."""
-    ours = build("wheel", ROOT, tmp_path, ERA_HAPTICS_ENGINE="1")
-    python, abi, platform = ours.stem.split("-")[-3:]
+def test_wheel_of_a_platform_brings_its_libraries(
+    wheel: Path, platform_wheel: Path, tmp_path: Path
+) -> None:
+    """It is tagged for the platform; its libraries are loaded where there is no compiler."""
+    python, abi, platform = platform_wheel.stem.split("-")[-3:]
     assert (python, abi) == ("py3", "none")
     assert platform in set(platform_tags())
     assert not platform.startswith("linux_")  # which no package index takes
-    with zipfile.ZipFile(ours) as archive, zipfile.ZipFile(wheel) as plain:
+    with zipfile.ZipFile(platform_wheel) as archive, zipfile.ZipFile(wheel) as plain:
         assert set(archive.namelist()) - set(plain.namelist()) == {
             "sim/soft_amp/sound-engine.so",
             *(f"model/compiled/{version.file}" for version in versions()),
@@ -137,7 +146,9 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     done = subprocess.run(
         [
             *(sys.executable, "-c"),
-            "from sim.soft_amp.engine import library as found; print(found()._name)",
+            "from model.compiled.kernels import kernels\n"
+            "from sim.soft_amp.engine import library\n"
+            "print(kernels().library._name, library()._name)",
         ],
         env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "", "CC": "no-such-compiler"},
         cwd=tmp_path,
@@ -145,7 +156,62 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
         text=True,
         check=True,
     )
-    assert Path(done.stdout.strip()) == tmp_path / "installed/sim/soft_amp/sound-engine.so"
+    kernels, engine = map(Path, done.stdout.split())
+    assert kernels.parent == tmp_path / "installed/model/compiled"
+    assert engine == tmp_path / "installed/sim/soft_amp/sound-engine.so"
+
+
+@pytest.mark.long
+def test_editable_installation_gets_the_libraries_of_its_processor(tmp_path: Path) -> None:
+    """They are in the tree, the wheel has none, and those of other processors are not compiled."""
+    tree = tmp_path / "tree"
+    for name in (*PACKAGES, "firmware", "examples"):
+        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("*.so"))
+    for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py", "build_libraries.py"):
+        shutil.copy2(ROOT / name, tree)
+    program = "import sys; from hatchling.build import build_editable; build_editable(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], cwd=tree, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        assert [name for name in archive.namelist() if name.endswith(".so")] == []
+    compiled = {path.relative_to(tree).as_posix() for path in tree.rglob("*.so")}
+    assert compiled == {library.file for library in tree_libraries()}
+
+
+def test_library_is_compiled_if_its_sources_differ_from_those_it_was_compiled_of(
+    tmp_path: Path,
+) -> None:
+    """Also if an older source file comes back; otherwise the file stays."""
+    source, path = tmp_path / "number.c", tmp_path / "number.so"
+    library = Library(path.name, (source,), (), ())
+    numbers = []
+    for number, age in ((7, 0), (8, 60), (7, 0), (7, 0)):
+        source.write_text(f"int number(void) {{ return {number}; }}")
+        time = LATER + age
+        os.utime(source, (time, time))
+        update([library], tmp_path)
+        loaded = ctypes.CDLL(str(shutil.copy(path, tmp_path / f"{len(numbers)}.so")))
+        numbers.append(loaded.number())
+    assert numbers == [7, 8, 7, 7]
+    compiled = path.stat().st_ino
+    update([library], tmp_path)
+    assert path.stat().st_ino == compiled
+
+
+@pytest.mark.parametrize("compiler", ["/nowhere/cc", "false"])
+def test_compiler_that_fails_leaves_no_library(
+    compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error names the compiler."""
+    source = tmp_path / "seven.c"
+    source.write_text("int seven(void) { return 7; }")
+    monkeypatch.setenv("CC", compiler)
+    library = Library("seven.so", (source,), (), ())
+    with pytest.raises(BuildError, match=compiler):
+        update([library], tmp_path)
+    with pytest.raises(BuildError, match=compiler):
+        compile_library(library, tmp_path / "seven.so")
+    assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]
 
 
 @pytest.mark.long
@@ -232,6 +298,11 @@ assert era("config", "check", RIG) == 0
 assert era("plate", "show", RIG) == 0
 assert era("amp", "status", f"sim://{RIG}") == 0
 """
+NUMPY = """
+import pathlib
+import model.compiled.kernels as compiled
+compiled.KERNEL_FOLDER = pathlib.Path("nowhere")
+"""
 WORK = """
 assert era("table", "build", RIG, "--mesh", "11x9", "--output", "t.npz") == 0
 assert era("table", "query", "t.npz", "--target", "0.08,0.06", "--quiet", "0.22,0.16") == 0
@@ -248,22 +319,23 @@ assert era("design", RIG, "--mesh", "11x9", "--layouts", "random:1", "--finalist
 
 
 @pytest.mark.parametrize(
-    ("compiler", "work"),
+    ("has_kernels", "work"),
     [
-        pytest.param("", "", id="shown"),
-        pytest.param("", WORK + DESIGN, id="numpy-design", marks=pytest.mark.long),
-        pytest.param(os.environ["PATH"], WORK + DESIGN, id="c-design", marks=pytest.mark.long),
+        pytest.param(False, "", id="shown"),
+        pytest.param(False, WORK + DESIGN, id="numpy-design", marks=pytest.mark.long),
+        pytest.param(True, WORK + DESIGN, id="c-design", marks=pytest.mark.long),
     ],
 )
-def test_what_needs_no_wire_needs_no_posix(tmp_path: Path, compiler: str, work: str) -> None:
+def test_what_needs_no_wire_needs_no_posix(tmp_path: Path, has_kernels: bool, work: str) -> None:
     """A rig and its plate are shown; table, playback and design write files; numpy warns once."""
+    program = HIDDEN + ("" if has_kernels else NUMPY) + SHOWN + work
     done = subprocess.run(
-        [sys.executable, "-X", "warn_default_encoding", "-c", HIDDEN + SHOWN + work, str(RIG)],
+        [sys.executable, "-X", "warn_default_encoding", "-c", program, str(RIG)],
         capture_output=True,
         text=True,
         check=False,
         cwd=tmp_path,
-        env={**os.environ, "PATH": compiler, "XDG_CACHE_HOME": str(tmp_path / "cache")},
+        env={**os.environ, "PATH": "", "XDG_CACHE_HOME": str(tmp_path / "cache")},
     )
     assert done.returncode == 0, done.stderr
     if not work:
@@ -271,8 +343,7 @@ def test_what_needs_no_wire_needs_no_posix(tmp_path: Path, compiler: str, work: 
     assert (tmp_path / "t.npz").stat().st_size > 100_000
     assert (tmp_path / "played.png").read_bytes().startswith(b"\x89PNG")
     assert any((tmp_path / "design").iterdir())
-    assert done.stderr.count("there is no C compiler") == (not compiler)
-    assert any((tmp_path / "cache").rglob("kernels-*.so")) == bool(compiler)
+    assert done.stderr.count(WITHOUT_KERNELS) == (not has_kernels)
 
 
 @pytest.mark.parametrize("command", shortly(["status", "sim rig.yaml --serial"], ["status"]))

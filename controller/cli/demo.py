@@ -152,7 +152,11 @@ def _read_touches(file: Path) -> "Scene":
 
 
 def _table_of(rig: "Rig", rig_file: Path, *, is_quiet: bool) -> "LocalizationTable":
-    """Return the table of a rig from the cache, or build it; print how long it took."""
+    """Return the table of a rig from the cache, or build it; print how long it took.
+
+    Also print whether C kernels or numpy compute the answers.
+    """
+    from model.compiled.kernels import arithmetic
     from model.table.table_file import cached_table
 
     with (
@@ -167,6 +171,7 @@ def _table_of(rig: "Rig", rig_file: Path, *, is_quiet: bool) -> "LocalizationTab
             f"{rig_file.name}: table of {eras} {solver} {table.mesh}, ready in "
             f"{timed.elapsed:.1f} s"
         )
+        print(arithmetic())
     return table
 
 

@@ -448,7 +448,7 @@ def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:
 
 def prepared_table(config: DaemonConfig) -> LocalizationTable:
     """Load the table that the configuration names, or build the one of its rig."""
-    kernels()  # may be compiled, which must not be in the event loop
+    kernels()  # load the library here, not in the event loop
     if config.table is not None:
         return _load_table(config, config.table)
     table, file = cached_table(config.rig)

@@ -1,7 +1,7 @@
 """The engine of a software amplifier: its library, settings and counters.
 
-The library is `firmware/ports/sound/sound.h`, from a wheel of this platform or compiled at first
-use.
+The library is `firmware/ports/sound/sound.h`, compiled when era-haptics is installed
+(`build_libraries.py`).
 """
 
 import ctypes
@@ -10,41 +10,26 @@ from functools import cache
 from pathlib import Path
 
 from drivers.errors import LinkError
-from model.compiled.kernels import compile_library, kept_library
 from model.errors import InputError
 from sim.soft_amp.settings import Law, SoftAmplifierLine, SoftAmplifierSettings
 
-ENGINE = "sound-engine.so"
-"""File of the library in a platform wheel; a module name would hide this module."""
-
-_HERE = Path(__file__).parent
-_FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout
-_PARTS = ("core", "wire", "ports/sound")
-_CORE = ("channel", "layers", "set", "sine", "states", "voice")
-_WIRE = ("crc", "mbap", "messages", "modbus", "serial")
-_FLAGS = (
-    "-std=c99",
-    "-O2",
-    "-fno-math-errno",
-    "-pthread",
-    '-DCONFIG_FILE="sound_config.h"',
-)
-_WHAT = "soft-amp: its engine"
+ENGINE_FILE = Path(__file__).with_name("sound-engine.so")
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """Load the library, and compile it if necessary; raises InputError."""
-    own = _HERE / ENGINE
-    if own.exists():
-        try:
-            return ctypes.CDLL(str(own))
-        except OSError as problem:
-            raise InputError(
-                f"soft-amp: {own} cannot be loaded: {problem}; reinstall era-haptics"
-            ) from None
-    sources, headers, flags = _recipe()
-    return kept_library("soft-amp", sources, headers, flags=flags, what=_WHAT)
+    """Load the library; raises InputError."""
+    if not ENGINE_FILE.exists():
+        raise InputError(
+            "soft-amp: its engine is compiled when era-haptics is installed, and there was no C "
+            "compiler; install one (Debian: apt install gcc libc6-dev), then reinstall era-haptics"
+        )
+    try:
+        return ctypes.CDLL(str(ENGINE_FILE))
+    except OSError as error:
+        raise InputError(
+            f"soft-amp: {ENGINE_FILE} cannot be loaded: {error}; reinstall era-haptics"
+        ) from None
 
 
 def callback_address(name: str) -> int:
@@ -52,34 +37,6 @@ def callback_address(name: str) -> int:
     address = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
     assert address is not None  # noqa: S101  of a function
     return address
-
-
-def compile_engine(path: Path) -> None:
-    """Compile the library to a file; raises InputError."""
-    sources, _, flags = _recipe()
-    compile_library(path, sources, flags=flags, what=_WHAT)
-
-
-def _recipe() -> tuple[list[Path], list[Path], list[str]]:
-    """Sources, headers and flags of the compiler; raises InputError."""
-    folder = _source_folder()
-    sources = [folder / "core" / f"{name}.c" for name in _CORE]
-    sources += [folder / "wire" / f"{name}.c" for name in _WIRE]
-    sources += (folder / "ports" / "sound").glob("*.c")
-    headers: list[Path] = []
-    flags = list(_FLAGS)
-    for part in _PARTS:
-        headers += (folder / part).glob("*.h")
-        flags.append(f"-I{folder / part}")
-    return sources, headers, flags
-
-
-def _source_folder() -> Path:
-    """The folder of the C sources; raises InputError."""
-    for folder in _FOLDERS:
-        if (folder / "ports" / "sound").is_dir():
-            return folder
-    raise InputError(f"soft-amp: its C sources are missing in {_FOLDERS[0]}; reinstall era-haptics")
 
 
 class Counters(ctypes.Structure):

@@ -236,9 +236,10 @@ def test_lines_say_of_each_touch_what_was_promised_and_felt(
 
     With a rig of one's own its table comes next. Without a capture the scenes are the examples'.
     """
-    status, (head, scale, _, _, _, *lines) = demo(*given, "--real-time")
+    status, (head, arithmetic, scale, _, _, _, *lines) = demo(*given, "--real-time")
     assert status == 0
     assert re.search(r"\.yaml: table of 4 ERAs on a mesh of 12x9, ready in [0-9]\.\d s$", head)
+    assert arithmetic.startswith("answers are computed by ")
     assert scale == SCALE
     assert "".join(lines).startswith(LINES)
     assert lines[-3:-1] == ["no contents.png: WHY\n", "wrote drawn/t.png\n"]

@@ -41,8 +41,6 @@ from era_haptics.command import run_era
 from era_haptics.lab.conformance.contract import judge, of_kind
 from kit.clock import judged
 from kit.weekend_boards import BuiltBoard
-from model.caching import cache_folder
-from model.compiled.kernels import kernels
 from model.rig.rig_file import load_rig
 from packages import PACKAGES
 from processes.daemons import (
@@ -296,8 +294,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_page_commands_print_what_is_shown(name: str, tmp_path: Path, installed: Path) -> None:
     """Commands, run in order, print the output on the page.
 
-    In a checkout with examples and firmware alone, for a reader for whom kernels were compiled;
-    `pip` installs prebuilt packages.
+    In a checkout with examples and firmware alone; `pip` installs prebuilt packages.
     """
     steps, folder = read_steps(PAGES / f"{name}.md"), tmp_path / "checkout"
     assert sum(step.shown is not None for step in steps) >= 2
@@ -307,11 +304,6 @@ def test_page_commands_print_what_is_shown(name: str, tmp_path: Path, installed:
         home = Path(short)
         site, programs = home / "site", home / "bin"
         programs.mkdir()
-        kernels()  # compiled here, if nowhere before
-        kept = home / "cache" / cache_folder().name
-        kept.mkdir(parents=True)
-        for library in cache_folder().glob("kernels-*"):
-            shutil.copy2(library, kept)
         words = [sys.executable, str(PIP), str(installed), str(site)]
         (pip := programs / "pip").write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', "utf-8")
         pip.chmod(0o755)

@@ -1,16 +1,17 @@
-"""Kernels in C for each kind of processor, and the same in numpy where there is no compiler."""
+"""C kernels for each kind of processor, and their references in numpy."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from build_libraries import kernel_library, update
 from cases import shortly
 from model.compiled import kernels
-from model.errors import InputError
+from model.compiled.versions import versions
 
 HAS = kernels.processor_features()
-RUNNABLE = {each.name: each for each in kernels.versions() if each.features.keys() <= HAS}
+RUNNABLE = {each.name: each for each in versions() if each.features.keys() <= HAS}
 FASTEST = next(iter(RUNNABLE))  # the one that is used
 
 
@@ -18,14 +19,10 @@ FASTEST = next(iter(RUNNABLE))  # the one that is used
 def without_kernels(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Iterator[Callable[[], None]]:
-    """Takes the compiler away until the test is over."""
-
-    def fail(*_: object, **__: object) -> None:
-        raise InputError("no C compiler")
+    """Takes the C kernels away until the test is over."""
 
     def take() -> None:
-        monkeypatch.setattr(kernels, "kept_library", fail)
-        monkeypatch.setattr(kernels, "KERNEL_FOLDER", tmp_path)  # nor one of a wheel
+        monkeypatch.setattr(kernels, "KERNEL_FOLDER", tmp_path)
         kernels.kernels.cache_clear()
 
     yield take
@@ -44,8 +41,9 @@ def kernels_or_numpy(
         without_kernels()
         return
     version = RUNNABLE[request.param]
+    update([kernel_library(version)])
     monkeypatch.setattr(kernels, "processor_features", version.features.keys)
     kernels.kernels.cache_clear()
     found = kernels.kernels()
-    assert found is not None, "install a C compiler"
+    assert found is not None
     assert found.lanes == version.lanes

@@ -1,10 +1,8 @@
-"""Parallel tasks on processes and clusters, the compiled library, versions, and small helpers.
+"""Parallel tasks on processes and clusters, the C kernels, versions, and small helpers.
 
-The library is built, cached, and refused if damaged; its memory is judged under sanitizers.
+The kernels are chosen by processor; their memory is judged under sanitizers.
 """
 
-import ctypes
-import hashlib
 import json
 import os
 import signal
@@ -12,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,18 +17,13 @@ import numpy as np
 import pytest
 
 import model.compiled
+from build_libraries import Library, compile_library, kernel_library
 from model import caching, processes
 from model.arrays import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
 from model.caching import NUMERICS_VERSION, code_version
-from model.compiled import kernels as library_cache
-from model.compiled.kernels import (
-    Version,
-    compile_library,
-    kernels,
-    processor_features,
-    versions,
-    why_slow,
-)
+from model.compiled import kernels as compiled_kernels
+from model.compiled.kernels import kernels, processor_features, why_slow
+from model.compiled.versions import Version, versions
 from model.errors import InputError
 from model.processes import on_cluster, on_processes
 from reference_figures import RECORD, reference_figures
@@ -243,186 +235,63 @@ def test_knots_are_within_the_stroke_and_their_memory(version: Version, tmp_path
     program = tmp_path / "harness"
     folder, harness = Path(*model.compiled.__path__), Path(__file__).with_name("knots_harness.c")
     files = (f"-I{folder}", "-o", str(program), str(harness), "-lm")
-    subprocess.run(["cc", *version.flags, *SANITIZERS, *files], check=True)
+    flags = kernel_library(version).flags
+    subprocess.run(["cc", *flags, *SANITIZERS, *files], check=True)
     done = subprocess.run([program], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "1.000"
     assert not done.stderr
 
 
-_PROGRAM = """
-import sys
-import time
-from pathlib import Path
-from model.compiled.kernels import kept_library
-found = kept_library("seven", [Path(sys.argv[1])], flags=(), what="seven")
-print(found.seven())
-"""
-
-
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """The cache folder of these tests."""
-    return tmp_path / "cache" / "era-haptics"
+def libraries(tmp_path: Path) -> Path:
+    """A folder with a library per version, whose function `lanes` returns the version's lanes."""
+    for version in versions():
+        source = tmp_path / f"{version.name}.c"
+        source.write_text(f"int lanes(void) {{ return {version.lanes}; }}")
+        library = Library(version.file, (source,), (), ())
+        compile_library(library, tmp_path / version.file)
+    return tmp_path
 
 
-def seven(folder: Path) -> int:
-    """What a function that returns seven gives, compiled or kept, in a process of its own."""
-    source = folder.parents[1] / "seven.c"
-    source.write_text("int seven(void) { return 7; }")
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM, str(source)],
-        env=os.environ | {"XDG_CACHE_HOME": str(folder.parent)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return int(done.stdout)
-
-
-def forge(path: Path, *, mode: int = 0o755, checksum_mode: int = 0o644) -> None:
-    """Put a library there that returns eight, with its checksum, of these rights."""
-    source = path.with_suffix(".c")
-    source.write_text("int seven(void) { return 8; }")
-    compile_library(path, [source], flags=(), what="eight")
-    source.unlink()
-    path.chmod(mode)
-    checksum = path.with_name(f"{path.name}.sha256")
-    checksum.write_text(hashlib.sha256(path.read_bytes()).hexdigest())
-    checksum.chmod(checksum_mode)
-
-
-def exchange(path: Path) -> None:
-    """Put another library there, without its checksum."""
-    forge(path)
-    path.with_name(f"{path.name}.sha256").unlink()
-
-
-def test_library_unsafe_or_not_whole_is_compiled_again(folder: Path) -> None:
-    """It is not loaded, and the next process finds a good one.
-
-    The first page alone is left after a power failure: what is mapped beyond it is SIGBUS. Every
-    user may have written a library or its checksum.
-    """
-    assert seven(folder) == 7
-    (path,) = folder.glob("*.so")
-    good = path.read_bytes()
-    for damage in (
-        lambda: os.truncate(path, 4096),
-        lambda: forge(path, mode=0o777),
-        lambda: forge(path, checksum_mode=0o666),
-        lambda: exchange(path),
-    ):
-        damage()
-        assert seven(folder) == 7
-        assert path.read_bytes() == good
-    forge(path)  # safe and whole: what is kept is loaded
-    assert seven(folder) == 8
-
-
-@pytest.mark.long
-def test_folder_in_which_others_write_is_not_used(folder: Path) -> None:
-    """Neither the folder nor one above it, unless it is sticky as /tmp; no library is left."""
-    assert seven(folder) == 7
-    (path,) = folder.glob("*.so")
-    forge(path)
-    for each in (folder, folder.parent):
-        each.chmod(0o777)
-        assert seven(folder) == 7
-        each.chmod(0o700)
-    assert seven(folder) == 8
-    folder.parent.chmod(0o1777)
-    assert seven(folder) == 8
-
-
-@pytest.mark.long
-def test_link_in_a_folder_of_others_is_not_followed(folder: Path) -> None:
-    """They could lead it to any library that the user keeps; one of the user's own is followed."""
-    kept = folder.parents[1] / "kept"
-    kept.mkdir(mode=0o700)
-    folder.parent.symlink_to(kept)
-    assert seven(folder) == 7
-    (path,) = folder.glob("*.so")
-    forge(path)
-    assert seven(folder) == 8
-    shared = folder.parents[1] / "shared"
-    shared.mkdir()
-    shared.chmod(0o777)
-    folder.parent.rename(shared / "link")
-    folder.parent.symlink_to(shared / "link")
-    assert seven(folder) == 7
-
-
-def test_files_of_another_user_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Root's are not: who could write them need not."""
-    path = tmp_path / "library.so"
-    path.touch(0o755)
-    library_cache.check_own(path)
-    owner = os.geteuid()
-    if owner:
-        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
-    else:
-        os.chown(path, 1, -1)
-    with pytest.raises(PermissionError):
-        library_cache.check_own(path)
-    library_cache.check_own(Path("/"))
-
-
-def test_least_recently_used_libraries_are_removed(folder: Path) -> None:
-    """With their checksums; names hold the C library, so that another one compiles its own."""
-    folder.mkdir(parents=True, mode=0o700)
-    for number in range(library_cache.MAX_KEPT_LIBRARIES + 1):
-        for name in (f"old{number}.so", f"old{number}.so.sha256"):
-            (folder / name).touch()
-            os.utime(folder / name, (number, number))
-    assert seven(folder) == 7
-    (path,) = folder.glob("seven-*.so")
-    kept = {f"old{number}.so" for number in range(2, library_cache.MAX_KEPT_LIBRARIES + 1)}
-    kept |= {path.name}
-    assert {each.name for each in folder.iterdir()} == kept | {f"{name}.sha256" for name in kept}
-    assert os.confstr("CS_GNU_LIBC_VERSION").replace(" ", "") in path.name
-
-
-@pytest.fixture
-def source(tmp_path: Path) -> Path:
-    """Of a function that returns seven."""
-    path = tmp_path / "seven.c"
-    path.write_text("int seven(void) { return 7; }")
-    return path
-
-
-@pytest.mark.parametrize("cc", ["/nowhere/cc", "false", "sleep 60 #"])
-def test_compiler_that_gives_no_library_is_bad_input(
-    cc: str,
-    source: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("features", "missing", "expected"),
+    [
+        ((), (), 4),
+        (("AVX2",), (), 4),
+        (("AVX2", "FMA3"), (), 8),
+        (("AVX2", "FMA3", "AVX512F", "AVX512DQ", "AVX512VL"), (), 16),
+        (("AVX2", "FMA3", "AVX512F", "AVX512DQ", "AVX512VL"), ("avx512",), 8),
+        (("AVX2", "FMA3"), ("avx2", "plain"), None),
+    ],
+)
+@pytest.mark.skipif(len(versions()) == 1, reason="this architecture has one version of the kernels")
+def test_kernels_are_the_fastest_that_the_processor_can_run(
+    features: tuple[str, ...],
+    missing: tuple[str, ...],
+    expected: int | None,
+    libraries: Path,
     without_kernels: Callable[[], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Neither is there a file then, nor a part of one.
-
-    Without a compiler there is no library, no error, and words that say how much slower it is.
-    """
-    assert kernels() is not None
-    assert why_slow() is None
-    with monkeypatch.context() as patch:
-        patch.setenv("CC", cc)
-        patch.setattr(library_cache, "COMPILE_TIMEOUT", 0.01)
-        with pytest.raises(InputError):
-            compile_library(tmp_path / "seven.so", [source], flags=(), what="seven")
-    assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]
+    """Among the libraries that are there; without one, a sentence says that answers are slow."""
     without_kernels()
+    for name in missing:
+        (libraries / f"kernels-{name}.so").unlink()
+    monkeypatch.setattr(compiled_kernels, "KERNEL_FOLDER", libraries)
+    monkeypatch.setattr(compiled_kernels, "processor_features", lambda: frozenset(features))
+    loaded = kernels()
+    assert (loaded and loaded.library.lanes()) == expected
+    assert (loaded and loaded.lanes) == expected
+    assert (why_slow() is None) == (expected is not None)
+
+
+def test_damaged_kernels_are_not_used(
+    without_kernels: Callable[[], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A warning names the file, and numpy computes."""
+    without_kernels()
+    for version in versions():
+        (compiled_kernels.KERNEL_FOLDER / version.file).write_bytes(b"no library")
     assert kernels() is None
+    assert "kernels-" in caplog.text
     assert why_slow()
-
-
-def test_threads_compile_the_same_at_once(source: Path, tmp_path: Path) -> None:
-    """Each in a folder of its own, so that no thread loads a part of the library."""
-    path = tmp_path / "seven.so"
-
-    def load(_: int) -> int:
-        compile_library(path, [source], flags=(), what="seven")
-        return int(ctypes.CDLL(str(path)).seven())
-
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(load, range(4))) == [7] * 4
-    assert {each.name for each in tmp_path.iterdir()} == {"seven.c", "seven.so"}

@@ -22,8 +22,10 @@ from ctypes import CDLL, c_char_p
 from dataclasses import dataclass
 from pathlib import Path
 
+from build_libraries import kernel_library, update
 from model.answer.stimulus import Placement
-from model.compiled.kernels import processor_features, versions
+from model.compiled.kernels import processor_features
+from model.compiled.versions import versions
 
 ROOT = Path(__file__).parents[2]
 TESTS = (
@@ -188,6 +190,7 @@ def main() -> int:
     if options.here:
         answer_here(options.here)
         return 0
+    update(kernel_library(version) for version in versions())
     has = processor_features()
     for processor in EVERY:
         if lacks := sorted(processor.features - has):

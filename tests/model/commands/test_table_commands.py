@@ -89,7 +89,7 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("plain_pictures")
-def test_commands_say_that_there_is_no_compiler(
+def test_commands_say_that_there_are_no_kernels(
     without_kernels: Callable[[], None], tmp_path: Path
 ) -> None:
     """`era table build` and `era config check`, with how much longer answers take."""

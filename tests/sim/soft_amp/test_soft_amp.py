@@ -39,7 +39,7 @@ from processes.sound_cards import RATE as CARD_RATE
 from processes.sound_cards import SoftAmp, host, jack_server
 from processes.steady_host import WATCHDOG, linear_amplifier
 from processes.typed_page import ERA
-from sim.soft_amp.engine import Counters, compile_engine, library, start_engine
+from sim.soft_amp.engine import Counters, library, start_engine
 from sim.soft_amp.output import default_block, may_be_realtime, portaudio_device, portaudio_stream
 from sim.soft_amp.settings import (
     Law,
@@ -210,11 +210,13 @@ def test_more_than_16_channels_are_two_amplifiers() -> None:
     assert urls == ["modbus+tcp://h:1/1", "modbus+tcp://h:1/2"]
 
 
-def test_no_compiler_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what to install."""
-    monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.raises(InputError, match="no-such-compiler"):
-        compile_engine(tmp_path / "engine.so")
+def test_missing_engine_is_an_error_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says what to install."""
+    monkeypatch.setattr("sim.soft_amp.engine.ENGINE_FILE", tmp_path / "missing.so")
+    with pytest.raises(InputError, match="apt install gcc libc6-dev"):
+        library.__wrapped__()
 
 
 def test_link_follows_the_terminal_and_has_one_user(tmp_path: Path) -> None:

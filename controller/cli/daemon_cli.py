@@ -5,11 +5,12 @@ Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `reload`, `strength`, `touc
 """
 
 import json
+import math
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,7 @@ from registry.plugins import did_you_mean
 if TYPE_CHECKING:
     from controller.api.client import Client
     from controller.api.methods import ArmResult
+    from model.arrays import Point
 
 Socket = Annotated[
     Path | None,
@@ -43,6 +45,7 @@ _MORE_TOPICS = ["amplifiers", "latency", "strength", "layout"]
 
 _RELOAD_TIMEOUT = 130.0  # s; the daemon gives up after 60 s, and another reload can come first
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
+_MOVE_INTERVAL = 0.02  # s; of a moving finger's positions
 
 
 class DashboardCommand(TyperCommand):
@@ -178,7 +181,8 @@ def strength(
 
 def touch(
     at: Annotated[
-        list[str], typer.Argument(metavar="X,Y ...", help="Positions of fingers in metres.")
+        list[str],
+        typer.Argument(metavar="X,Y[:X,Y] ...", help="Position or path of each finger, in metres."),
     ],
     duration: Annotated[
         float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration in s.")
@@ -188,41 +192,80 @@ def touch(
 ) -> None:
     """Put fingers on the plate for a while, and show the status.
 
-    Each finger feels the layout's effect at its position. Without a layout, the last finger feels a
-    buzz and the others are quiet.
+    A finger with several points moves along the lines between them, at constant speed, as in `era
+    touch 0.05,0.18:0.30,0.18 --for 2`. Each finger feels the layout's effect at its position.
+    Without a layout, the last finger feels a buzz and the others are quiet.
     """
-    from model.config.units import in_metres, parse_point
+    from model.config.units import parse_point
 
-    positions = [parse_point(text, what="era touch") for text in at]
+    paths = []
+    for text in at:
+        paths.append([parse_point(point, what="era touch") for point in text.split(":")])
     with connected(socket) as era:
         plate = era.hello("era").rig
-        length, width = plate.length_m, plate.width_m
-        for x, y in positions:  # the daemon would only count fingers outside the plate as rejected
-            if not (0 <= x <= length and 0 <= y <= width):
-                remedy = in_metres(x, y, length=length, width=width)
-                remedy = remedy or "; coordinates start at its south-west corner"
-                raise InputError(
-                    f"era touch must be on the plate of {length:g} m by {width:g} m, "
-                    f"got {x:g},{y:g}{remedy}"
-                )
+        for path in paths:
+            _check_on_plate(path, length=plate.length_m, width=plate.width_m)
         started_at = time.monotonic()
-        _hold(era, positions, started_at + duration / 2)
+        _report_fingers(era, paths, started_at, duration, until=duration / 2)
         status = era.status()  # right after a touch, whose contact lasts for 150 ms
-        _hold(era, positions, started_at + duration)
+        _report_fingers(era, paths, started_at, duration, until=duration)
         era.touch([], source="era touch")
     from controller.cli.status_text import show_status
 
     typer.echo(status.model_dump_json() if as_json else show_status(status))
 
 
-def _hold(era: "Client", positions: list[tuple[float, float]], end: float) -> None:
-    """Repeat fingers until a time of time.monotonic() [s], and once more at that time."""
+def _check_on_plate(path: Sequence["Point"], *, length: float, width: float) -> None:
+    """Raise InputError for points outside the plate, which the daemon would only count."""
+    from model.config.units import in_metres
+
+    for x, y in path:
+        if 0 <= x <= length and 0 <= y <= width:
+            continue
+        remedy = in_metres(x, y, length=length, width=width)
+        remedy = remedy or "; coordinates start at its south-west corner"
+        raise InputError(
+            f"era touch must be on the plate of {length:g} m by {width:g} m, "
+            f"got {x:g},{y:g}{remedy}"
+        )
+
+
+def _report_fingers(
+    era: "Client",
+    paths: Sequence[Sequence["Point"]],
+    started_at: float,
+    duration: float,
+    *,
+    until: float,
+) -> None:
+    """Report the fingers of `era touch` repeatedly, and once more at the end.
+
+    started_at: of time.monotonic() [s]; until [s]: time since then; duration [s]: of a whole path.
+    """
+    is_moving = any(len(path) > 1 for path in paths)
+    interval = _MOVE_INTERVAL if is_moving else _REPEAT_INTERVAL
     while True:
-        era.touch(positions, source="era touch")
-        remaining = end - time.monotonic()
-        if remaining <= 0:
+        elapsed = min(time.monotonic() - started_at, until)
+        share = elapsed / duration if duration else 0.0
+        era.touch([position_on(path, share) for path in paths], source="era touch")
+        if elapsed >= until:
             return
-        time.sleep(min(remaining, _REPEAT_INTERVAL))
+        time.sleep(min(until - elapsed, interval))
+
+
+def position_on(path: Sequence["Point"], share: float) -> "Point":
+    """Return the position [m] on straight lines between points, after a share of their length."""
+    lines = list(pairwise(path))
+    lengths = [math.dist(start, end) for start, end in lines]
+    remaining = share * sum(lengths)
+    for (start, end), length in zip(lines, lengths, strict=True):
+        if remaining < length:
+            fraction = remaining / length
+            x = start[0] + fraction * (end[0] - start[0])
+            y = start[1] + fraction * (end[1] - start[1])
+            return x, y
+        remaining -= length
+    return path[-1]
 
 
 def watch(
@@ -267,7 +310,8 @@ def watch(
             else:
                 from controller.cli.status_text import show_event
 
-                typer.echo(show_event(event, ahead=now.unix_time_s - now.time_s))
+                ahead = now.unix_time_s - now.time_s
+                typer.echo(show_event(event, ahead=ahead, threshold=now.threshold))
 
 
 def reload(socket: Socket = None, as_json: JsonOption = False) -> None:

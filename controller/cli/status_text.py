@@ -1,6 +1,8 @@
 """Format the daemon's status and events for display."""
 
+from collections.abc import Mapping
 from datetime import datetime
+from typing import Any
 
 from controller.api.link import Notification
 from controller.api.methods import StatusResult
@@ -14,13 +16,31 @@ from drivers.protocol.definition import READINGS
 from model.quantities import counted
 
 
-def show_event(event: Notification, *, ahead: float) -> str:
-    """Format an event; ahead: offset of the wall clock to the daemon's [s]."""
+def show_event(event: Notification, *, ahead: float, threshold: str | None) -> str:
+    """Format an event.
+
+    ahead: offset of the wall clock to the daemon's [s]; threshold: the rig's set, if known.
+    """
+    labels = {"foreign_level_db_sl": "foreign_level_db_sl (most sensitive threshold set)"}
+    if threshold is not None:
+        labels["rig_foreign_level_db_sl"] = f"rig_foreign_level_db_sl ({threshold})"
     at = datetime.fromtimestamp(event.time + ahead).isoformat(timespec="milliseconds")[11:]
-    line = f"{at}  {event.topic:10s} {in_words(event.data)}"
+    line = f"{at}  {event.topic:10s} {in_words(_relabeled(event.data, labels))}"
     if event.lost:
         line += f"  ({event.lost} lost)"
     return line
+
+
+def _relabeled(value: Any, labels: Mapping[str, str]) -> Any:
+    """Return a JSON value with labels in place of some of its keys, at any depth."""
+    if isinstance(value, list):
+        return [_relabeled(item, labels) for item in value]
+    if not isinstance(value, Mapping):
+        return value
+    relabeled = {}
+    for key, item in value.items():
+        relabeled[labels.get(key, key)] = _relabeled(item, labels)
+    return relabeled
 
 
 def show_status(status: StatusResult) -> str:

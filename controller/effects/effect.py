@@ -223,6 +223,8 @@ class Effect(TunedSection, ABC):
     """Its name in layouts."""
     is_for_motion: ClassVar[bool]
     """Whether it follows a moving finger and belongs under `on_move`."""
+    motion_condition: ClassVar[str] = "while the finger moves"
+    """When a motion effect is felt, for the reason of a finger that feels nothing."""
     needs_region: ClassVar[bool] = False
     """Whether it works only in regions."""
     needs_entry: ClassVar[bool] = True

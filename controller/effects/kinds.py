@@ -141,6 +141,7 @@ class Detents(Effect):
 
     kind: ClassVar[str] = "detents"
     is_for_motion: ClassVar[bool] = True
+    motion_condition: ClassVar[str] = "as the finger passes a detent"
 
     spacing: Annotated[float, Quantity(LENGTH, at_least=0.002, at_most=0.2)] = 0.010
     """Distance between detents."""
@@ -171,6 +172,7 @@ class Dial(Effect):
 
     kind: ClassVar[str] = "dial"
     is_for_motion: ClassVar[bool] = True
+    motion_condition: ClassVar[str] = "as the finger passes a detent"
     needs_region: ClassVar[bool] = True
 
     spacing: Annotated[float, Quantity(ANGLE, at_least=0.05, at_most=3.2)] = _DEGREES_15

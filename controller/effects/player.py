@@ -173,7 +173,7 @@ class EffectPlayer:
         if key in self._stimulated:
             return f"{name} is felt only by the newest finger outside all regions; lift that finger"
         if play.effect.is_for_motion:
-            return f"{name} is not felt at rest; move the finger"
+            return f"{name} is felt only {play.effect.motion_condition}"
         return f"{name} pauses; it continues on its own"
 
     def replace(self, layout: SurfaceLayout) -> None:

@@ -10,7 +10,7 @@ from functools import partial
 
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, clock_at, high_word
-from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
+from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Rows, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import unpack_frames
@@ -246,6 +246,34 @@ def _more(page: str) -> str:
     )
 
 
+_READINGS: Sequence[tuple[str, Values]] = (
+    ("GetCaps", {}),
+    ("GetStatus", {}),
+    ("GetFaults", {}),
+    ("GetAchieved", {"layer": 0}),
+)
+"""Requests that an amplifier answers before it can be armed."""
+
+
+def _readings() -> str:
+    """Return the readings of a disarmed amplifier on a serial line, and the words of replies."""
+    exchange = _Exchange("serial", 9)
+    frames = {name: exchange.request(name, values) for name, values in _READINGS}
+    rows = list[tuple[Sequence[int], str]]()
+    for name, values in _READINGS:
+        reply = exchange.amplifier.handle(name, values, _NOW)
+        rows += _titled(_REPLY_NAMES[name], MESSAGES[name].reply, reply)
+    return f"{_block(frames)}\n\n{_words(rows)}"
+
+
+_REPLY_NAMES = {
+    "GetCaps": "Capabilities",
+    "GetStatus": "Status",
+    "GetFaults": "Faults",
+    "GetAchieved": "Achieved",
+}
+
+
 def _words(rows: Iterable[tuple[Sequence[int], str]]) -> str:
     """Return rows of words with what stands beside them, as a block of code."""
     shown = [(" ".join(f"{word % 0x10000:04X}" for word in words), text) for words, text in rows]
@@ -319,6 +347,11 @@ def _fields(record: Record, values: Values) -> Iterator[tuple[Sequence[int], str
                 size, text = 1, ", ".join(f"{name} {values.get(name, 0):d}" for name, _ in parts)
             case Numbers(name=name, count=count):
                 size, text = values[count], name
+            case Rows(name=name, record=row_record):
+                for row_number, row in enumerate(values[name]):
+                    row_text = ", ".join(text for _, text in _fields(row_record, row))
+                    yield row_record.pack(row), f"{name} {row_number}: {row_text}"
+                continue
             case Rest():
                 continue
             case _:
@@ -367,7 +400,11 @@ def _titled(title: str, record: Record, values: Values) -> list[tuple[Sequence[i
 
 BYTES: Mapping[str, Mapping[str, Callable[[], str]]] = {
     "protocol": {"join": _join_words},
-    "serial": {"join": partial(_join, "serial"), "more": partial(_more, "serial")},
+    "serial": {
+        "join": partial(_join, "serial"),
+        "more": partial(_more, "serial"),
+        "readings": _readings,
+    },
     "modbus": {**{"join": partial(_join, "modbus"), "more": partial(_more, "modbus"), "rtu": _rtu}},
     "can": {"join": partial(_join, "can"), "more": partial(_more, "can")},
 }

@@ -330,9 +330,11 @@ class BlockingAmplifier:
         return self._wait(self._applied(layers))
 
     def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> StagedSet:
-        """Play these layers for a time [s], feed the watchdog and wait for the end.
+        """Play these layers for a time [s], and feed the watchdog meanwhile.
 
-        Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
+        Returns when the layers begin to fade along their ramps or endings; the plate is silent
+        only after these. Raises CommandRefused if the amplifier stops by itself, or its replies
+        contradict requests.
         """
         _require_layers(layers)
         staged = self.apply([replace(layer, valid_for=duration) for layer in layers])

@@ -210,6 +210,10 @@ def run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool 
         return asyncio.run(work)
 
 
+_UNKNOWN_IF_NONE = ("clock_error_s",)
+"""Rows that are shown without a value, too."""
+
+
 def _act(
     action: Coroutine[Any, Any, dict[str, Any]],
     *,
@@ -222,7 +226,12 @@ def _act(
     if json_:
         print(json.dumps(result))
         return result
-    rows = {key: value for key, value in result.items() if value not in (None, "")}
+    rows = {}
+    for key, value in result.items():
+        if value is None and key in _UNKNOWN_IF_NONE:
+            rows[key] = "unknown"
+        elif value not in (None, ""):
+            rows[key] = value
     width = max(map(len, rows))
     for key, value in rows.items():
         print(f"{key:{width}}  {in_words(value)}")

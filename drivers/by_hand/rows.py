@@ -7,6 +7,7 @@ from typing import Any
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import REPORTS, reports_of
 from drivers.protocol.definition import (
+    CLOCK_UNKNOWN,
     FAULTS,
     FEATURES,
     HIGH_STEPS,
@@ -47,6 +48,8 @@ def capability_rows(capabilities: Values) -> dict[str, Any]:
     """Return capabilities in readable form; features: optional ones."""
     rows = in_units(MESSAGES["GetCaps"].reply, capabilities)
     rows["channel_limits"] = rows.pop("limits")
+    if capabilities["clock_error"] == CLOCK_UNKNOWN:
+        rows["clock_error_s"] = None
     rows["features"] = names_of_bits(FEATURES, capabilities["features"])
     return rows
 

@@ -304,10 +304,10 @@ class Sensation:
     """Median of the same contrast over the plates."""
     promised_contrast_db: float | None = None
     foreign_levels_db_sl: tuple[float, ...] = ()
-    """Promised level of all other vibrations at the loudest point here, by threshold set.
+    """Promised level of all other vibrations at the loudest point here, for each threshold set.
 
-    The rig's own set comes first. Empty for a finger that neither feels a vibration nor is kept
-    quiet.
+    In the order of `table.threshold_sets`: `dict(zip(table.threshold_sets, levels))`. Empty for a
+    finger that neither feels a vibration nor is kept quiet.
     """
     lowered_db: float = 0.0
     """Reduction below the requested level [dB]."""

@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -133,7 +134,7 @@ class _ProgressLines:
         if now - self._printed < _LINE_INTERVAL:
             return
         self._printed = now
-        sys.stderr.write(f"{done} of {total} {self._unit}{self._remaining(now)}\n")
+        sys.stderr.write(f"era: {done} of {total} {self._unit}{self._remaining(now)}\n")
 
     def _remaining(self, now: float) -> str:
         """Format the remaining time of the stage, if it can be estimated."""
@@ -152,8 +153,14 @@ def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_js
 
 
 def next_line(*words: str | Path) -> str:
-    """Format the next command for the shell, with quotes where they are needed."""
+    """Format the next command for the shell, with quotes where they are needed.
+
+    If `era` is not on the PATH, the command starts with its path.
+    """
     arguments = [str(word) for word in words]
+    running = sys.argv[0]
+    if arguments[0] == Path(running).stem and shutil.which(arguments[0]) is None:
+        arguments[0] = running
     if os.name == "nt":
         from subprocess import list2cmdline
 

@@ -1,6 +1,6 @@
 """`era table show` and `era table verify`: a table's summary, and its answers by other methods."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from model.study.weak_cells import WeakCells
 
 
+_LIMITS_SHOWN = 3
+_SHOWN_FROM = 0.05  # dB
+
+
 def show(
     table_file: TableArgument,
     weak: Annotated[bool, typer.Option("--weak", help="List every weak cell.")] = False,
@@ -29,12 +33,15 @@ def show(
 ) -> None:
     """Show a table's levels, weak cells, contrast and origin."""
     from model.study.overview import find_overview, summarize
+    from model.study.promise_cost import tolerance_costs
     from model.table.table_file import load_table
 
     table = load_table(table_file)
     with Stopwatch() as timed, progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
-    summary, cells = summarize(table, overview), overview.cells
+        costs = tolerance_costs(table)
+    cells = overview.cells
+    summary = summarize(table, overview) | {"tolerance_costs_db": costs}
     length, width, _ = summary["plate_m"]
     quarter, across = (f"{part * length:.3g},{part * width:.3g}" for part in (0.25, 0.75))
     rows = [
@@ -94,6 +101,7 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
         ("dead zones", f"{percent('dead_zone_share')} (below {FELT_DB_SL:g} dB SL at full stroke)"),
         ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),
         *contrast,
+        ("limited by", _limits_in_words(summary["tolerance_costs_db"])),
         (
             "mesh",
             f"{summary['mesh_name']}, error of the fields "
@@ -105,6 +113,17 @@ def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
         ("fingerprint", summary["fingerprint"]),
     ]
     return [f"{name:20s} {value}" for name, value in rows]
+
+
+def _limits_in_words(costs_db: Mapping[str, float]) -> str:
+    """Name the tolerances that cost most contrast; costs_db: by key, the most expensive first."""
+    largest = []
+    for key, cost in list(costs_db.items())[:_LIMITS_SHOWN]:
+        if cost >= _SHOWN_FROM:
+            largest.append(f"{key} {cost:.1f} dB")
+    if not largest:
+        return "no tolerance of the rig"
+    return f"{', '.join(largest)} of promised contrast to 1 other (tolerances of the rig)"
 
 
 def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:

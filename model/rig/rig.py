@@ -218,7 +218,7 @@ class Rig:
     threshold: str = DEFAULT_THRESHOLD
     """Name of the threshold set to which levels are relative (`model.finger`)."""
     promised_thresholds: tuple[str, ...] = THRESHOLDS
-    """Names of additional threshold sets for which promises hold."""
+    """Threshold sets for which promises hold, in addition to `threshold`."""
     supports: tuple[str, ...] = ()
     """Names of the ERAs without an amplifier."""
     outputs: frozenset[str] = frozenset()

@@ -916,8 +916,9 @@ class RigSection(Section):
         list[ThresholdSet],
         Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
     ]
-    """Additional threshold sets for which promises hold: the set with the lowest promise counts.
-    Default: all published sets. To base promises on `threshold` alone, list only that set.
+    """Threshold sets for which promises hold: the set with the lowest promise counts, and
+    `threshold` always counts. Default: all published sets. To base promises on `threshold` alone,
+    list only that set.
 
     Limits: a list of `vibrotactile-probe`, `pressing-fingertip`
     """

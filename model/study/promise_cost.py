@@ -1,27 +1,31 @@
-"""What errors cost: the contrast that two contents keep with a kind of error, and without it.
+"""What errors cost: the promised contrast with a kind of error, and without it.
 
-From answers at a few positions and frequencies of the nominal plate, in a second: with clock errors
-of amplifiers, in the rig's weather, or with an object on the plate.
+From answers at a few positions, in a second: with clock errors of amplifiers, in the rig's weather,
+with an object on the plate, or with each tolerance of a table's rig.
 """
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from model.answer.plan import answer, worst_of
-from model.answer.stimulus import Finger, Stimulus
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.ensemble.draws import ClockErrors
+from model.errors import InputError
 from model.finger import FINGERTIP_RADIUS
-from model.rig.rig import Rig
+from model.rig.rig import BOUNDS, Rig
 from model.study.contact_sets import random_contacts
+from model.study.weak_cells import contrasts_of
 from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.table_file import TableProblem, solve_table
 
 _PAIRS = 16
+_QUESTIONS = 8  # for each tolerance
 _SEED = 14
 _LEVEL_DB_SL = 14.0
 _FREQUENCY_STEP = 20.0  # Hz
@@ -59,6 +63,37 @@ def uncertainty_cost(rig: Rig, key: str) -> PromiseCost:
     without_key = replace(rig.uncertainty, **{key: 0.0})
     exact_table = replace(table, uncertainty=without_key)
     return _cost(_promised_db(exact_table), _promised_db(table))
+
+
+def tolerance_costs(table: LocalizationTable) -> dict[str, float]:
+    """Return how much each tolerance of the rig costs [dB], the most expensive first.
+
+    By key of `uncertainty`: by how much the promised contrast with one quiet finger rises if this
+    tolerance is 0, averaged over random positions. Empty if the plate is too small for two fingers,
+    or reaches the level nowhere.
+    """
+    rng = np.random.default_rng(_SEED)
+    questions = []
+    with suppress(InputError):
+        for _ in range(_QUESTIONS):
+            target, quiet = random_contacts(rng, 2, table.plate, margin=FINGERTIP_RADIUS)
+            questions.append(Placement((target,), (quiet,)))
+    promised = [contrasts_of(table, question) for question in questions]
+    costs = {}
+    for key, (exact, _) in BOUNDS.items():
+        if getattr(table.uncertainty, key) == exact:
+            continue
+        uncertainty = replace(table.uncertainty, **{key: exact})
+        exact_table = replace(table, uncertainty=uncertainty)
+        gains = []
+        for question, kept in zip(questions, promised, strict=True):
+            without_error = contrasts_of(exact_table, question)
+            if kept is not None and without_error is not None:
+                gains.append(without_error[0] - kept[0])
+        if gains:
+            costs[key] = float(np.mean(gains))
+    by_cost = sorted(costs.items(), key=lambda cost: cost[1], reverse=True)
+    return dict(by_cost)
 
 
 def _coarse_table(rig: Rig) -> LocalizationTable:

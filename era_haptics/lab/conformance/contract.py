@@ -52,6 +52,7 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     reading_checks.unknown_types,
     reading_checks.reading_changes_nothing,
     reading_checks.hello_for_ever,
+    reading_checks.half_words,
     frame_checks.areas,
     frame_checks.pieces,
     reading_checks.objects,

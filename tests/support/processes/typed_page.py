@@ -369,7 +369,7 @@ def _is_about(shown: str, printed: str) -> bool:
     return abs(float(shown) - float(printed)) <= allowed
 
 
-_PROGRESS = re.compile(r"^\d+ of \d+ [a-z ]+(, about \d+ (s|min) left)?\n", re.MULTILINE)
+_PROGRESS = re.compile(r"^era: \d+ of \d+ [a-z ]+(, about \d+ (s|min) left)?\n", re.MULTILINE)
 """Lines that appear where a command takes long; how many depends on the machine."""
 
 READER_PATIENCE = 300.0  # s; for one command, on a machine that is busy with other things

@@ -519,8 +519,14 @@ _LASTING, _QUICK = 1.5, 0.01  # s; of a layer, whose end shows a wrong rate; for
 _SHIFTS = 1, 0x4000, 0xC001
 
 
+_UNSTATED = (
+    "clock_error is 65535, unknown; measure the largest error of a clock reading and state it in "
+    "the capabilities"
+)
+
+
 def _require_known(subject: Subject) -> None:
-    require(subject.can["clock_error"] != CLOCK_UNKNOWN, "clock_error is not stated")
+    require(subject.can["clock_error"] != CLOCK_UNKNOWN, _UNSTATED)
 
 
 async def _read(subject: Subject, otherwise: type[ContractViolation] = ContractViolation) -> None:

@@ -213,8 +213,7 @@ async def reading_changes_nothing(subject: Subject) -> None:
 async def hello_for_ever(subject: Subject) -> None:
     """Hello of any version and length: Identity; other messages: UNSUPPORTED_VERSION.
 
-    Handle Hello before the version check, ignore its payload and reply in version 0. Reject half a
-    word with BAD_LENGTH.
+    Handle Hello before the version check, ignore its payload and reply in version 0.
     """
     client = cast(SerialClient, subject.client)
     for payload, version in ((b"", 3), (b"\1\2\3", 0), (b"\1", 77), (b"", 2)):
@@ -223,6 +222,16 @@ async def hello_for_ever(subject: Subject) -> None:
     for version in (0, 2, 3, 255):
         answer = await client.exchange(MESSAGES["GetStatus"].number, (), version=version)
         expect_equal(answer.code, "UNSUPPORTED_VERSION", f"code for a frame of version {version}")
+
+
+@reading("protocol.md#order-of-checks", "serial")
+async def half_words(subject: Subject) -> None:
+    """Request with an odd number of bytes: BAD_LENGTH; of an unknown type: UNKNOWN_TYPE.
+
+    Check the type first. If a byte is left over after the last whole word, reject the request with
+    BAD_LENGTH before you read its words.
+    """
+    client = cast(SerialClient, subject.client)
     ping = MESSAGES["Ping"].number
     for number, words, code in (
         (ping, [1, 0], "BAD_LENGTH"),

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -159,7 +159,7 @@ def next_line(*words: str | Path) -> str:
     """
     arguments = [str(word) for word in words]
     running = sys.argv[0]
-    if arguments[0] == Path(running).stem and shutil.which(arguments[0]) is None:
+    if arguments[0] == PurePath(running).stem and shutil.which(arguments[0]) is None:
         arguments[0] = running
     if os.name == "nt":
         from subprocess import list2cmdline

@@ -25,6 +25,7 @@ import pytest
 import typer
 from typer.core import TyperGroup
 
+from controller.cli.daemon_cli import position_on
 from controller.cli.main import LoadModules, join_commands, run
 from controller.daemon.children import gateway_options
 from controller.process.daemon_process import SocketLock
@@ -105,6 +106,15 @@ def test_socket_that_cannot_be_locked_or_listen_is_no_second_daemon(
         lock.bind()
     assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
     lock.release()
+
+
+def test_touch_moves_a_finger_at_constant_speed_along_its_points() -> None:
+    """Halfway along 3 m and then 4 m at a right angle, a finger is 0.5 m into the second line."""
+    path = [(0.0, 0.0), (3.0, 0.0), (3.0, 4.0)]
+    assert position_on(path, 0.5) == pytest.approx((3.0, 0.5))
+    assert position_on(path, 0.0) == (0.0, 0.0)
+    assert position_on(path, 1.0) == (3.0, 4.0)
+    assert position_on(path[:1], 0.5) == (0.0, 0.0)
 
 
 def test_full_disk_is_named_by_the_file_that_has_no_room(tmp_path: Path) -> None:

@@ -144,7 +144,8 @@ def close_pairs(together: Sequence[JointTouch]) -> str:
     more = f" and {len(close) - _NAMED} more" if len(close) > _NAMED else ""
     return (
         f", but {len(close)} of {counted(len(pairs), 'pair')} of regions below "
-        f"{MIN_CONTRAST_DB:g} dB together: {', '.join(named)}{more}"
+        f"{MIN_CONTRAST_DB:g} dB together: {', '.join(named)}{more}; move these regions apart, or "
+        "widen or remove their bands"
     )
 
 

@@ -28,7 +28,7 @@ from drivers.by_hand.links import Arrangement, arrangement_of, check_links
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
-from drivers.protocol.definition import FEATURES, READINGS, STATUS_FLAGS
+from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, READINGS, STATUS_FLAGS
 from drivers.trace import tracing
 from drivers.urls import (
     CLOCK_ERRORS,
@@ -394,6 +394,14 @@ def test_unconfirmed_stop_exits_3_and_a_confirmed_one_names_the_next_command() -
     *rows, last = invoke("stop", URL).stdout.splitlines()
     assert last == f"Next: era amp clear '{URL}'"
     assert all(len(row.split()) > 1 for row in rows)  # no cause, as nothing went wrong
+
+
+def test_unknown_clock_error_is_shown_as_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """65535 on the wire is no time: null in JSON, and `unknown` in the text."""
+    unknown = {**capabilities(4), "clock_error": CLOCK_UNKNOWN}
+    monkeypatch.setattr(simulated_amplifier, "capabilities", lambda *_, **__: unknown)
+    assert result_of("identify", URL)["clock_error_s"] is None
+    assert re.search(r"^clock_error_s +unknown$", invoke("identify", URL).stdout, re.MULTILINE)
 
 
 def test_stop_needs_no_trace(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import os
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -363,6 +364,15 @@ def test_next_line_is_for_the_shell(
         elsewhere.setattr(os, "name", system)
         said = next_line("era", "table", "show", "my $plates/t.npz", "--weak")
     assert said == line
+
+
+def test_next_line_has_the_path_of_era_when_era_is_not_on_the_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Typed as `.venv/bin/era` in a shell without the environment, the next command works, too."""
+    monkeypatch.setattr(sys, "argv", [".venv/bin/era", "demo"])
+    monkeypatch.setenv("PATH", "")
+    assert next_line("era", "status") == "Next: .venv/bin/era status"
 
 
 CASES: list[dict[str, Any]] = read_yaml(Path(__file__).with_name("printed.yaml"))

@@ -15,7 +15,14 @@ from typer.testing import CliRunner
 import era_haptics as era
 from controller.cli.config_cli import app as config_commands
 from drivers.urls import CLOCK_ERRORS
-from kit.plates import FREQUENCIES, make_paper_rig, small_table, smooth_rig, with_strokes
+from kit.plates import (
+    FREQUENCIES,
+    make_paper_rig,
+    small_table,
+    smooth_rig,
+    smooth_table,
+    with_strokes,
+)
 from kit.set_table import only
 from model.answer.stimulus import Placement
 from model.cli import app
@@ -26,7 +33,7 @@ from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import table_export
 from model.study.overview import find_overview, summarize
-from model.study.promise_cost import PromiseCost, clock_cost
+from model.study.promise_cost import PromiseCost, clock_cost, tolerance_costs
 from model.study.table_export import export_csv, export_mat
 from model.study.weak_cells import WeakCells, find_weak_cells, map_grid, pair_questions, text_map
 from model.table.table_file import build_table
@@ -80,6 +87,18 @@ def test_config_check_tells_what_clocks_cost(
     assert clocks["error_us"] == {"a": USB_US, "b": error_us}
     assert clocks["kept_contrast_db"] < clocks["exact_contrast_db"]
     assert len([each for each in found["warnings"] if "contents" in each]) == warnings
+
+
+def test_tolerance_costs_name_the_uncertain_keys_and_grow_with_them() -> None:
+    """Only keys that are uncertain cost contrast, and twice the tolerance costs more."""
+    table = smooth_table()
+    costs = []
+    for stiffness in (0.1, 0.2):
+        uncertainty = replace(Uncertainty.none(), stiffness=stiffness)
+        costs.append(tolerance_costs(replace(table, uncertainty=uncertainty)))
+    assert [*costs[0]] == ["stiffness"]
+    assert 0 < costs[0]["stiffness"] < costs[1]["stiffness"]
+    assert tolerance_costs(replace(table, uncertainty=Uncertainty.none())) == {}
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
 from model.answer.answer import Answer
 from model.answer.plan import query
-from model.answer.promise import RingingUnderFingers
+from model.answer.ringing import RingingUnderFingers
 from model.answer.stimulus import DriveEnvelope, Placement
 from model.arrays import ComplexArray, FloatArray
 from model.finger import fingertip_points, fingertip_weights

@@ -30,8 +30,9 @@ from model.answer.answer import (
     Answer,
     Layer,
 )
+from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer, prepare_answers
-from model.answer.promise import FingersOnPlate, loudest_power, promise
+from model.answer.promise import loudest_power, promise
 from model.answer.stimulus import BY_NAME, MUST, Finger, Placement, Stimulus
 from model.arrays import FloatArray, Point, lattice, nullable
 from model.ensemble.draws import PROMISED_DRAWS

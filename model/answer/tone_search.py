@@ -28,16 +28,16 @@ from model.answer.answer import (
     Stream,
     Tones,
 )
-from model.answer.promise import (
+from model.answer.fingers_on_plate import (
     CENTRE_AND_FOUR,
     CENTRE_AND_RIM,
     MAX_FINGERS_BY_POINT,
     MAX_VARIANCE_FINE,
+    DriveTones,
     FingersOnPlate,
-    RingingUnderFingers,
-    on_drawn_plates,
-    promised,
 )
+from model.answer.promise import promised
+from model.answer.ringing import RingingUnderFingers, on_drawn_plates
 from model.arrays import (
     Complex64Array,
     Float32Array,
@@ -290,8 +290,8 @@ def choose_by_numpy(
         quiet = loudest[:, [*contents.quiet]]
         level = float(contents.levels[0])
         best[0] = best_tone(level, found.scores, own, quiet, least)
-    tones = tones_of([found.drives[each] for each in best.tolist()])
-    return promised(fingers, contents, *tones, is_apart=is_apart, ringing=ringing)
+    tones = DriveTones.of([found.drives[each] for each in best.tolist()])
+    return promised(fingers, contents, tones, is_apart=is_apart, ringing=ringing)
 
 
 def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
@@ -449,7 +449,7 @@ def _judged(
         for stream, drive in zip(found.streams.tolist(), found.drives, strict=True)
     ]
     parts = [
-        fingers.felt(JUDGING_DRAWS, *tones_of(drives[first:][:_BATCH]))
+        fingers.felt(JUDGING_DRAWS, DriveTones.of(drives[first:][:_BATCH]))
         for first in range(0, len(drives), _BATCH)
     ]
     means = np.concatenate([part for part, _ in parts])
@@ -464,7 +464,9 @@ def _judged(
             order = of[best_first(percentile(by_energy))]
             loudest[order[IN_TIME:]], some = _TOO_LOUD, order[:IN_TIME]
             tried = [found.drives[each] for each in some.tolist()]
-            lasting = fingers.felt(JUDGING_DRAWS, *tones_of(tried))[0][:, targets, 0].min(axis=1)
+            lasting = fingers.felt(JUDGING_DRAWS, DriveTones.of(tried))[0][:, targets, 0].min(
+                axis=1
+            )
             during = [over.over_drive(drive) for drive in tried]
             gains = lasting * [each.gains[targets].min() for each in during] / own[some, 0]
             heard = np.array([each.heard.max(axis=1) for each in during])
@@ -476,13 +478,6 @@ def _judged(
             own[of] *= gain[:, None]
             loudest[of] *= gain[:, None, None] ** 2
     return least, own[:, 1:], loudest[:, :, 1:]
-
-
-def tones_of(drives: Sequence[WeightedTones]) -> tuple[IntArray, Complex64Array, IntArray]:
-    """Return rows (m,) and weights (m, n) of the tones of drives, and the drive of each (m,)."""
-    tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
-    rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))
-    return rows, weights, owners
 
 
 def best_tone(

@@ -37,8 +37,9 @@ from model.answer.answer import (
     Limits,
     verdict_of,
 )
+from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer, query
-from model.answer.promise import FingersOnPlate, RingingUnderFingers, on_drawn_plates
+from model.answer.ringing import RingingUnderFingers, on_drawn_plates
 from model.answer.stimulus import (
     ANY,
     BY_NAME,

@@ -24,7 +24,8 @@ from kit.set_table import only, phased, wants
 from model.answer import tone_search
 from model.answer.answer import Contents, Stream
 from model.answer.plan import answer, query
-from model.answer.promise import RingingUnderFingers, share_stroke
+from model.answer.promise import share_stroke
+from model.answer.ringing import RingingUnderFingers
 from model.answer.stimulus import (
     Course,
     DriveEnvelope,

@@ -14,8 +14,8 @@ import pytest
 from kit.direct_plate import direct_acceleration
 from kit.plates import LENGTH, WIDTH, contact_sets, smooth_rig
 from model.answer.answer import Answer
+from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer
-from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, FloatArray
 from model.ensemble.attached_plate import MODELLED, PlateOnEras, attach, thickness_nodes

@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 from kit.direct_plate import direct_acceleration
 from model.answer.answer import Answer
-from model.answer.promise import FingersOnPlate
+from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, Point
 from model.drive_modes import Forms, WeightedTones

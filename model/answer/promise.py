@@ -68,7 +68,7 @@ class _Comparison:
     """Level (k, 2): nominal and promised."""
     contrast: FloatArray
     """Contrast (k, 3)."""
-    foreign: FloatArray
+    foreign_level: FloatArray
     """Foreign level (k,)."""
     worst: float
     """Promised contrast of the worst finger."""
@@ -116,7 +116,7 @@ def promised(
         comparisons.append(_compared(contents, tones, powers.scaled(by_tone, by_harmonic), shares))
 
     contrast = np.array([comparison.contrast for comparison in comparisons])
-    foreign = np.array([comparison.foreign for comparison in comparisons])
+    foreign_level = np.array([comparison.foreign_level for comparison in comparisons])
     worst = np.array([comparison.worst for comparison in comparisons])
     return Tones(
         rows=tones.rows.tolist(),
@@ -125,7 +125,7 @@ def promised(
         owners=tones.owners.tolist(),
         contrast_db=decibels(contrast.min(axis=0)).tolist(),
         level_db_sl=decibels(comparisons[0].level).tolist(),
-        foreign_db_sl=decibels(foreign.T).tolist(),
+        foreign_db_sl=decibels(foreign_level.T).tolist(),
         worst_db=float(decibels(worst.min())),
         stroke_factor=stroke_factor,
         is_apart=is_apart,
@@ -178,7 +178,7 @@ def _compared(
     finger_count = len(contents.places)
     level = np.full((finger_count, 2), np.nan)
     contrast = np.full((finger_count, 3), np.nan)
-    foreign = np.full(finger_count, np.nan)
+    foreign_level = np.full(finger_count, np.nan)
     own_tones = dict[int, NDArray[np.bool_]]()
     felt_by_finger = dict[int, Float32Array]()
     for number, stream in enumerate(contents.streams):
@@ -205,13 +205,13 @@ def _compared(
         foreign_amplitude = np.sqrt(np.maximum(foreign_power, _TINY))
         ratio = np.asarray(felt / foreign_amplitude)
         ratios.append(ratio)
-        foreign[finger] = promise(foreign_amplitude, 100 - PROMISED_PERCENTILE)
+        foreign_level[finger] = promise(foreign_amplitude, 100 - PROMISED_PERCENTILE)
         contrast[finger] = figures(ratio)
     worst = figures(np.asarray(np.min(ratios, axis=0))) if ratios else (np.nan,) * 3
     if len(contents.streams) == 1:
         # The contrast of a single content is that at the loudest quiet finger.
         contrast[[*contents.streams[0].targets]] = worst
-    return _Comparison(level, contrast, foreign, worst[2])
+    return _Comparison(level, contrast, foreign_level, worst[2])
 
 
 def _over_durations(

@@ -1,45 +1,30 @@
-"""Search for the tones of contents: a C kernel, and an equivalent in numpy.
+"""Search for the tones of contents: by a C kernel where it can, and otherwise in numpy.
 
-`choose_tones` packs a query for the kernel. `choose_by_numpy` handles cases that the kernel does
-not support (durations, envelopes, avoided frequencies, the drive mode `switched`) and machines
-without a compiler. It must give the same result: candidates for each content by
-`model.drive_modes`, evaluated on drawn plates; the promise is for the best combination.
+`choose_by_numpy` handles questions that the kernel does not support (durations, envelopes, avoided
+frequencies, the drive mode `switched`) and machines without the kernel. It must give the same
+result: candidates for each content by `model.drive_modes`, evaluated on drawn plates; the promise
+is for the best combination.
 """
 
-from array import array
-from collections.abc import Sequence
-from ctypes import addressof
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
-from typing import TypeAlias
-from weakref import WeakKeyDictionary
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model import drive_modes
-from model.answer.answer import (
-    KEPT,
-    MISSING,
-    PROMISED_PERCENTILE,
-    PRUNING_STEP,
-    REACHED,
-    Contents,
-    Stream,
-    Tones,
-)
+from model.answer.answer import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.answer.fingers_on_plate import (
     CENTRE_AND_FOUR,
-    CENTRE_AND_RIM,
     MAX_FINGERS_BY_POINT,
-    MAX_VARIANCE_FINE,
     DriveTones,
+    FingerForms,
     FingersOnPlate,
 )
+from model.answer.kernel_question import ask_kernel, is_for_kernel
 from model.answer.promise import promised
 from model.answer.ringing import RingingUnderFingers, on_drawn_plates
 from model.arrays import (
-    Complex64Array,
     Float32Array,
     FloatArray,
     IntArray,
@@ -47,22 +32,11 @@ from model.arrays import (
     best_first,
     best_of,
 )
-from model.compiled.kernels import (
-    FOUND,
-    FoundTones,
-    GivenQuestion,
-    GivenRaster,
-    PlateDraws,
-    Rules,
-    TouchedPlates,
-    WeightSearch,
-    kernels,
-    run_kernel,
-)
+from model.compiled.kernels import kernels
 from model.drive_modes import (
-    LEVEL_MARGIN,
     NEARLY_HIGHEST,
     UNRESTRICTED,
+    CoherentResult,
     Forms,
     WeightedTones,
     find_switched,
@@ -71,11 +45,9 @@ from model.drive_modes import (
     search_all,
     search_to_level,
 )
-from model.ensemble.draws import JUDGING_DRAWS, PERCENTILE, PROMISED_DRAWS, percentile
-from model.ensemble.expected_power import RIDGE
-from model.ensemble.kernel_plates import draws_structure, plates_structure
+from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger import decibels
-from model.table.table import SAME_FREQUENCY, LocalizationTable, given_raster
+from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_BY_POINT = 8
 """Frequencies at which weights over a duration are also searched with the points of fingertips."""
@@ -83,186 +55,70 @@ MAX_BY_POINT = 8
 IN_TIME = 3
 """Number of pulse candidates solved in time, the best by energy."""
 
-_TINY, _TOO_LOUD = 1e-20, 1e12  # powers; for rejected candidates
-
+_TINY = 1e-20  # power
+_TOO_LOUD = 1e12  # power of rejected candidates
 _BATCH = 64  # candidates evaluated together
 
 
 def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     """Choose tones for each content and compute their promises."""
-    streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
-    starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
-    is_here = contents.drive_mode == UNRESTRICTED and not contents.avoided
-    for stream in streams:
-        targets += stream.targets
-        starts.append(len(targets))
-        for band in stream.bands:
-            bands += band
-        priorities.append(stream.priority)
-        levels.append(10 ** (stream.level_db_sl / 20))
-        is_here = is_here and stream.duration is None
-    if by is None or not is_here:
-        return choose_by_numpy(table, contents, by_kernel=by is not None)
-    count, n, k = len(streams), len(table.eras), len(places)
-    kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
-    plates, raster, rules, by_count = kept
-    judging, promise, *stiffness = by_count.get(k) or by_count.setdefault(
-        k, _with_fingers(table, k)
-    )
-    if contents.loads.count(1.0) < len(contents.loads):
-        stiffness = [*_stiffness(table, k, contents.loads)]
-    # One array: building and reading several numpy arrays would take as long each.
-    numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
-    at = array("d", [coordinate for place in places for coordinate in place])
-    background = contents.background
-    given = GivenQuestion(
-        contents=count,
-        bands=len(streams[0].bands),
-        fingers=k,
-        quiet_count=len(quiet),
-        candidates=contents.candidates,
-        combinations=contents.combinations,
-        apart=contents.apart_hz,
-        numbers=numbers.buffer_info()[0],
-        level=levels.buffer_info()[0],
-        places=at.buffer_info()[0],
-        stiffness=stiffness[0].ctypes.data,
-        at_harmonics=stiffness[1].ctypes.data,
-        load_std=stiffness[2].ctypes.data,
-        background=None if background is None else background.ctypes.data,
-        judging=addressof(judging),
-        promise=addressof(promise),
-    )
-    size = 2 * n * count
-    of_fingers = k * (3 + 2 + rules.sets)
-    rows = array("i", bytes(4 * count))
-    figures = array("f", bytes(4 * (size + count + of_fingers + 2)))
-    to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
-    status = run_kernel(by.library.answer, to, plates, raster, rules, given)
-    if status != FOUND:
-        raise AssertionError("contents must have tones")
-    found = figures.tolist()
-    weights = map(complex, found[:size:2], found[1:size:2])
-    contrast = size + count
-    level, of_others = contrast + 3 * k, contrast + 5 * k
-    worst, factor = found[-2:]
-    return Tones(
-        rows=rows.tolist(),
-        weights=list(zip(*[weights] * n, strict=True)),
-        gains=found[size:contrast],
-        owners=range(count),
-        contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
-        level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
-        foreign_db_sl=list(zip(*[iter(found[of_others:-2])] * rules.sets, strict=True)),
-        worst_db=worst,
-        stroke_factor=factor,
-        is_apart=bool(to.is_apart),
-    )
-
-
-_Loads: TypeAlias = tuple[Complex64Array, Complex64Array, Float32Array]
-"""Stiffness of fingers, also at harmonics, and the uncertainty of their loads."""
-
-_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, *_Loads]
-"""Draws for evaluation and for promises; loads of fingers of load 1."""
-
-_Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
-"""Cached structures of a table: plate, raster, rules, and per number of fingers."""
-
-_kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
-
-
-def _kept_of(table: LocalizationTable) -> _Kept:
-    """Pack a table's plate and raster, and the selection rules, for kernels."""
-    uncertainty, groups = table.uncertainty, table.clocks.groups
-    variance = uncertainty.gain_variance
-    rules = Rules(
-        kept=KEPT,
-        missing=MISSING,
-        max_by_point=MAX_FINGERS_BY_POINT,
-        pruning_step=PRUNING_STEP,
-        rim_count=len(CENTRE_AND_RIM),
-        is_deep=variance < MAX_VARIANCE_FINE,
-        others=uncertainty.changes_modes,
-        gain_variance=variance,
-        ridge=RIDGE,
-        margin=LEVEL_MARGIN,
-        highest=drive_modes.NEARLY_HIGHEST,
-        reached=REACHED,
-        judged=PERCENTILE,
-        promised=PROMISED_PERCENTILE,
-        starts=drive_modes.TARGET_STARTS,
-        iterations=drive_modes.ALIGNMENTS,
-        again=drive_modes.REALIGNMENTS,
-        one_finger=_method(drive_modes.ONE_FINGER),
-        several=_method(drive_modes.SEVERAL),
-        within=(WeightSearch * 3)(*map(_method, drive_modes.WITHIN_STROKE)),
-        groups=1 + max(groups, default=0),
-        sets=len(table.threshold_sets),
-    )
-    rules.point(
-        rim=CENTRE_AND_RIM,
-        group=np.array(groups, dtype=np.int32) if groups else None,
-        threshold=table.thresholds,
-        error=table.error_power,
-        shares=table.power_shares,
-        frequencies=table.frequencies,
-        sensitivities=table.sensitivities.T,
-        search_error=table.search_error_power,
-        harmonic_threshold=table.compared_harmonic_thresholds,
-        harmonic_sensitivities=table.harmonic_sensitivities.T,
-    )
-    if uncertainty.harmonic > 0:
-        rules.at_harmonics = addressof(plates_structure(table.at_harmonics))
-    return plates_structure(table.on_eras), given_raster(table), rules, {}
-
-
-def _with_fingers(table: LocalizationTable, fingers: int) -> _Fingers:
-    """Draw the plates of a table with a number of fingers, in the kernels' format."""
-    judging, promise = (
-        draws_structure(table.on_eras, table.clocks, fingers, by)
-        for by in (JUDGING_DRAWS, PROMISED_DRAWS)
-    )
-    return judging, promise, *_stiffness(table, fingers)
-
-
-def _stiffness(table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()) -> _Loads:
-    """Return fingers' stiffness at a table's frequencies and at twice these, and standard
-    deviations."""
-    stiffness = table.attached.finger_stiffness(fingers, loads)
-    stds = table.attached.load_stds(fingers, loads)
-    if not table.uncertainty.harmonic:
-        return stiffness, stiffness, stds
-    return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads), stds
-
-
-def _method(of: drive_modes.LawsonMethod) -> WeightSearch:
-    return WeightSearch(
-        steps=of.steps,
-        limited=of.is_limited,
-        variance=of.variance,
-        gain=of.gain,
-        reserve=drive_modes.LEVEL_RESERVE,
-        growth=drive_modes.MAX_GROWTH,
-        most=drive_modes.MAX_MULTIPLIER,
-    )
+    library = kernels()
+    if library is not None and is_for_kernel(contents):
+        return ask_kernel(library, table, contents)
+    return choose_by_numpy(table, contents, by_kernel=library is not None)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class _Candidate:
+    """A drive that a content can use."""
+
+    content: int
+    band: int
+    """Number of the band within its content."""
+    score: float
+    drive: WeightedTones
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
     """m candidates of all contents."""
 
-    streams: IntArray
+    contents: IntArray
     """Content of each (m,)."""
     bands: IntArray
     """Band of each candidate (m,), by number within its content."""
     scores: FloatArray
     drives: Sequence[WeightedTones]
 
+    @classmethod
+    def of(cls, candidates: Sequence[_Candidate]) -> "_Candidates":
+        """Join candidates, in order."""
+        return cls(
+            np.array([candidate.content for candidate in candidates]),
+            np.array([candidate.band for candidate in candidates]),
+            np.array([candidate.score for candidate in candidates]),
+            [candidate.drive for candidate in candidates],
+        )
+
     @property
     def rows(self) -> IntArray:
         """Row of the first tone of each candidate (m,)."""
         return np.array([drive[0][0] for drive in self.drives], dtype=int)
+
+
+@dataclass(frozen=True, eq=False)
+class _Judgement:
+    """What m candidates give on d drawn plates.
+
+    Scaled to the contents' levels if there are several contents.
+    """
+
+    least: FloatArray
+    """Level (m,) that 90 % of plates reach, as an amplitude; nominal over a duration."""
+    own: FloatArray
+    """Amplitude (m, d) at the targets."""
+    loudest: FloatArray
+    """Squared amplitude (m, k, d) at the loudest points of all fingers."""
 
 
 def choose_by_numpy(
@@ -273,25 +129,37 @@ def choose_by_numpy(
     by_kernel: whether to solve the plate with fingers in C.
     """
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
-    ringing, rows = RingingUnderFingers.of_streams(table, contents), contents.rows
+    ringing = RingingUnderFingers.of_streams(table, contents)
     if contents.drive_mode == UNRESTRICTED:
-        is_ranked = contents.is_ranked and not any(ringing) and not table.clocks.groups
-        kept = ranked(fingers, contents) if is_ranked else rows
-        found, is_limited = _candidates(fingers, contents, kept, ringing)
-        if len(kept) < len(rows) and (not found.drives or is_limited):
-            found, is_limited = _candidates(fingers, contents, rows, ringing)
+        candidates = _coherent_candidates(fingers, contents, ringing)
     else:
-        found = _switched_candidates(fingers, contents, ringing[0])
-    least, own, loudest = _judged(fingers, contents, found, ringing)
-    best, is_apart = np.zeros(1, dtype=int), True
+        candidates = _switched_candidates(fingers, contents, ringing[0])
+    judgement = _judged(fingers, contents, candidates, ringing)
+    best = np.zeros(1, dtype=int)
+    is_apart = True
     if len(contents.streams) > 1:
-        best, is_apart = best_combination(table, contents, found, own, loudest)
-    elif len(found.drives) > 1:
-        quiet = loudest[:, [*contents.quiet]]
-        level = float(contents.levels[0])
-        best[0] = best_tone(level, found.scores, own, quiet, least)
-    tones = DriveTones.of([found.drives[each] for each in best.tolist()])
+        best, is_apart = best_combination(table, contents, candidates, judgement)
+    elif len(candidates.drives) > 1:
+        best[0] = best_tone(contents, candidates.scores, judgement)
+    tones = DriveTones.of([candidates.drives[number] for number in best.tolist()])
     return promised(fingers, contents, tones, is_apart=is_apart, ringing=ringing)
+
+
+def _coherent_candidates(
+    fingers: FingersOnPlate,
+    contents: Contents,
+    ringing: Sequence[RingingUnderFingers | None],
+) -> _Candidates:
+    """Find the best tones of each content among the most promising rows, or among all."""
+    rows = contents.rows
+    if contents.is_ranked and not any(ringing) and not fingers.table.clocks.groups:
+        ranked_rows = ranked(fingers, contents)
+        candidates, is_limited = _candidates_at(fingers, contents, ranked_rows, ringing)
+        is_enough = len(candidates.drives) > 0 and not is_limited
+        if is_enough or len(ranked_rows) == len(rows):
+            return candidates
+    candidates, _ = _candidates_at(fingers, contents, rows, ringing)
+    return candidates
 
 
 def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
@@ -299,238 +167,386 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
 
     Based on one form of all other fingers together.
     """
-    table, tips, touched = fingers.table, fingers.tips, fingers.touched
-    rows, target, others = contents.rows, contents.streams[0].targets[0], contents.others(0)
-    points, weights = tips.few, tips.few_weights
+    table = fingers.table
+    touched = fingers.touched
+    rows = contents.rows
+    target = contents.streams[0].targets[0]
+    others = contents.others(0)
+    points = fingers.tips.few
+    weights = fingers.tips.few_weights
     if len(others) > MAX_FINGERS_BY_POINT:
-        points, weights = touched.centres[:, None], np.ones_like(weights[:, :1])
+        points = touched.centres[:, None]
+        weights = np.ones_like(weights[:, :1])
     shares = np.zeros_like(weights)
     shares[others] = weights[others] / np.float32(len(others))
-    every = points.reshape(1, -1, points.shape[2])
-    found = touched.forms(rows, every, shares.reshape(1, -1), table.search_error_power)
-    fields = found.fields.reshape(len(rows), *points.shape[:2], -1)
+    contacts = touched.forms(
+        rows,
+        points.reshape(1, -1, points.shape[2]),
+        shares.reshape(1, -1),
+        table.search_error_power,
+    )
+    fields = contacts.fields.reshape(len(rows), *points.shape[:2], -1)
     mean = (weights[target] @ fields[:, target])[None]
-    level, threshold = float(contents.levels[0]), table.thresholds.take(rows)
-    power = found.power.swapaxes(0, 1)
-    searched = search_all(Forms(mean, power, found.power, threshold, level, 0.0))
-    order = best_first(searched.bound)
-    reaches = searched.score[order] > 0
+    forms = Forms(
+        mean,
+        contacts.power.swapaxes(0, 1),
+        contacts.power,
+        table.thresholds.take(rows),
+        float(contents.levels[0]),
+        0.0,
+    )
+    result = search_all(forms)
+    order = best_first(result.bound)
+    reaches = result.score[order] > 0
     # Rows that would beat the best one if they were loud enough.
-    first = int(reaches.argmax()) if reaches.any() else len(order)
-    missing = order[:first][:MISSING]
+    first_reaching = int(reaches.argmax()) if reaches.any() else len(order)
+    missing = order[:first_reaching][:MISSING]
     reaching = order[reaches][: KEPT - len(missing)]
-    return np.asarray(rows[np.sort(np.concatenate([reaching, missing]))])
+    best_places = np.sort(np.concatenate([reaching, missing]))
+    return np.asarray(rows[best_places])
 
 
-def _candidates(
+@dataclass(frozen=True, eq=False)
+class _SearchResult:
+    """The best weights for a content at some of the solved rows."""
+
+    places: IntArray
+    """Places of the rows among the solved ones."""
+    result: CoherentResult
+    is_limited: bool
+    """Whether the level was hard to reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class _ContentSearch:
+    """The search for tones of one content at the solved rows."""
+
+    finger_forms: FingerForms
+    steady: Forms
+    """Forms of its steady level at all solved rows."""
+    others: Sequence[int]
+    """Fingers from which the content is kept."""
+    ringing: RingingUnderFingers | None
+    """None for a content without a duration, or without other fingers, which ringing disturbs."""
+
+    def results(
+        self, places: IntArray, groups: Sequence[NDArray[np.bool_]]
+    ) -> Iterator[_SearchResult]:
+        """Search with each group of ERAs, by the mean over other fingers and by their points.
+
+        If any group reaches the level, the others do not count.
+        """
+        forms = _forms_at(places, self.steady, self.ringing)
+        by_group = list[tuple[Forms, _SearchResult]]()
+        reaching = list[tuple[Forms, _SearchResult]]()
+        for group in groups:
+            group_forms = forms.among(group)
+            result, searched_forms = search_to_level(group_forms)
+            is_lowered = searched_forms is not group_forms
+            is_limited = is_lowered or len(result.level_limited) > 0
+            by_group.append((searched_forms, _SearchResult(places, result, is_limited)))
+            if not is_lowered:
+                reaching.append(by_group[-1])
+        for searched_forms, by_mean in reaching or by_group:
+            yield by_mean
+            if 1 <= len(self.others) <= MAX_FINGERS_BY_POINT and by_mean.result.score.any():
+                yield self._by_point(by_mean, searched_forms)
+
+    def _by_point(self, by_mean: _SearchResult, searched_forms: Forms) -> _SearchResult:
+        """Search by the points of other fingers, for the level of a search by their means."""
+        places = by_mean.places
+        if self.ringing is not None:
+            best = best_first(by_mean.result.score)[:MAX_BY_POINT]
+            places = places[np.sort(best)]
+        steady = replace(
+            self.steady,
+            wanted=searched_forms.wanted,
+            driven=searched_forms.driven,
+            level_margin=searched_forms.level_margin,
+        )
+        steady_by_point = self.finger_forms.by_point(steady, self.others)
+        forms = _forms_at(places, steady_by_point, self.ringing)
+        return _SearchResult(places, search(forms), by_mean.is_limited)
+
+
+def _candidates_at(
     fingers: FingersOnPlate,
     contents: Contents,
     rows: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
-) -> tuple[Candidates, bool]:
+) -> tuple[_Candidates, bool]:
     """Find the best tones of each content in each band, and whether a level was hard to reach.
 
     With all ERAs together, or with each group of ERAs on a common clock.
     """
-    count, hertz = len(contents.streams), fingers.table.frequencies
-    every = np.arange(len(hertz)) if any(ringing) else rows
-    formed = fingers.forms(every, with_fine=True)
-    apart_hz = contents.apart_hz if count > 1 else 0.0
-    found: list[tuple[int, int, float, WeightedTones]] = []
+    content_count = len(contents.streams)
+    frequencies = fingers.table.frequencies
+    groups = _groups(fingers.table)
+    solved_rows = np.arange(len(frequencies)) if any(ringing) else rows
+    finger_forms = fingers.forms(solved_rows, with_fine=True)
+    apart_hz = contents.apart_hz if content_count > 1 else 0.0
+    candidates = list[_Candidate]()
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
-        over = ringing[number] if others else None  # a single finger's ringing disturbs no other
-        level = stream.level_db_sl + float(decibels(count))
-        rest = None if contents.background is None or others else contents.background[every]
-        lasting = formed.of(stream.targets, others, level, rest)
+        content_ringing = ringing[number] if others else None
+        level_db_sl = stream.level_db_sl + float(decibels(content_count))
+        rest_of_plate = None
+        if contents.background is not None and not others:
+            rest_of_plate = contents.background[solved_rows]
+        steady = finger_forms.of(stream.targets, others, level_db_sl, rest_of_plate)
+        content_search = _ContentSearch(finger_forms, steady, others, content_ringing)
         for band, (low, end) in enumerate(stream.bands):
-            here = np.flatnonzero(np.isin(every, rows) & (every >= low) & (every < end))
-            here = here if over is None else over.lasting_long_enough(here)
-            asked = _at(here, lasting, over)
-            groups = [asked.among(each) for each in _groups(fingers.table)]
-            searches = [(each, *search_to_level(each)) for each in groups]
-            reaching = [each for each in searches if each[2] is each[0]]
-            for own, searched, forms in reaching or searches:
-                is_limited |= len(searched.level_limited) > 0 or forms is not own
-                ways = [(here, searched)]
-                if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
-                    best = np.sort(best_first(searched.score)[:MAX_BY_POINT])
-                    some = here if over is None else here[best]
-                    tried = replace(lasting, wanted=forms.wanted, driven=forms.driven)
-                    tried = replace(tried, level_margin=forms.level_margin)
-                    by_point = formed.by_point(tried, others)
-                    ways.append((some, search(_at(some, by_point, over))))
-                for some, way in ways:
-                    at = every[some]
-                    for each in _apart(way.score, hertz[at], contents.candidates, apart_hz):
-                        drive = [(int(at[each]), way.weights[each])]
-                        found.append((number, band, float(way.score[each]), drive))
-    streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
-    return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+            is_in_band = (solved_rows >= low) & (solved_rows < end)
+            places = np.flatnonzero(np.isin(solved_rows, rows) & is_in_band)
+            if content_ringing is not None:
+                places = content_ringing.lasting_long_enough(places)
+            for search_result in content_search.results(places, groups):
+                is_limited |= search_result.is_limited
+                tone_rows = solved_rows[search_result.places]
+                result = search_result.result
+                chosen = _apart(result.score, frequencies[tone_rows], contents.candidates, apart_hz)
+                for index in chosen:
+                    drive = [(int(tone_rows[index]), result.weights[index])]
+                    score = float(result.score[index])
+                    candidates.append(_Candidate(number, band, score, drive))
+    return _Candidates.of(candidates), is_limited
 
 
 def _switched_candidates(
-    fingers: FingersOnPlate, contents: Contents, over: RingingUnderFingers | None
-) -> Candidates:
+    fingers: FingersOnPlate, contents: Contents, ringing: RingingUnderFingers | None
+) -> _Candidates:
     """Find the best patterns of the drive mode `switched` for a single content.
 
     Uses the ERAs of a single group at a time; near the highest level if no group reaches the
     requested level.
     """
-    (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
-    rows = rows if over is None or not quiet else over.lasting_long_enough(rows)
-    by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
-    every = np.arange(len(fingers.table.frequencies))
-    formed = fingers.forms(every, with_fine=by_point)
-    lasting = formed.of(stream.targets, quiet, stream.level_db_sl, contents.background)
-    if by_point:
-        lasting = formed.by_point(lasting, quiet, CENTRE_AND_FOUR)
-    forms = _at(rows, lasting, over if quiet else None)
+    (stream,) = contents.streams
+    quiet = contents.quiet
+    rows = contents.rows
+    if ringing is not None and quiet:
+        rows = ringing.lasting_long_enough(rows)
+    is_by_point = ringing is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
+    all_rows = np.arange(len(fingers.table.frequencies))
+    finger_forms = fingers.forms(all_rows, with_fine=is_by_point)
+    steady = finger_forms.of(stream.targets, quiet, stream.level_db_sl, contents.background)
+    if is_by_point:
+        steady = finger_forms.by_point(steady, quiet, CENTRE_AND_FOUR)
+    forms = _forms_at(rows, steady, ringing if quiet else None)
     groups = _groups(fingers.table)
-    among = [forms.among(each) for each in groups]
-    searches = [find_switched(each) for each in among]
-    among = [replace(each, level_margin=0.0) for each in among]
-    if not any(searches):
-        searches = [find_switched(each) for each in among]
-    if not any(searches):
-        highest = [NEARLY_HIGHEST * max_sensation_switched(each) for each in among]
-        levels = zip(among, highest, strict=True)
-        searches = [find_switched(replace(each, wanted=wanted)) for each, wanted in levels]
-    found = [
-        (score, drive)
-        for group, search in zip(groups, searches, strict=True)
-        for score, drive in search
-        if not any(weights[~group].any() for _, weights in drive)
+    candidates = list[_Candidate]()
+    patterns_by_group = _switched_patterns([forms.among(group) for group in groups])
+    for group, patterns in zip(groups, patterns_by_group, strict=True):
+        for score, pattern in patterns:
+            is_within_group = not any(weights[~group].any() for _, weights in pattern)
+            if is_within_group:
+                drive = [(int(rows[place]), weights) for place, weights in pattern]
+                candidates.append(_Candidate(0, 0, score, drive))
+    candidates.sort(key=attrgetter("score"), reverse=True)
+    return _Candidates.of(candidates)
+
+
+def _switched_patterns(
+    group_forms: Sequence[Forms],
+) -> list[list[tuple[float, WeightedTones]]]:
+    """Find switched patterns of each group: with the level's margin, without, or the loudest."""
+    patterns = [find_switched(forms) for forms in group_forms]
+    if any(patterns):
+        return patterns
+    without_margin = [replace(forms, level_margin=0.0) for forms in group_forms]
+    patterns = [find_switched(forms) for forms in without_margin]
+    if any(patterns):
+        return patterns
+    nearly_highest = [
+        replace(forms, wanted=NEARLY_HIGHEST * max_sensation_switched(forms))
+        for forms in without_margin
     ]
-    found.sort(key=itemgetter(0), reverse=True)
-    drives = [[(int(rows[row]), weights) for row, weights in drive] for _, drive in found]
-    none = np.zeros(len(found), dtype=int)
-    return Candidates(none, none, np.array([score for score, _ in found]), drives)
+    return [find_switched(forms) for forms in nearly_highest]
 
 
-def _at(some: IntArray, lasting: Forms, over: RingingUnderFingers | None) -> Forms:
+def _forms_at(places: IntArray, steady: Forms, ringing: RingingUnderFingers | None) -> Forms:
     """Select forms at some frequencies, by index, over the envelope if the stimulus has one."""
-    return lasting.at(some) if over is None else over.forms(lasting, some)
+    if ringing is None:
+        return steady.at(places)
+    return ringing.forms(steady, places)
 
 
 def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
     """Return masks (n,) of the ERAs that can play one content together, one per group."""
     groups = np.array(table.clocks.groups or [0] * len(table.eras))
-    return [groups == each for each in np.unique(groups)]
+    return [groups == group for group in np.unique(groups)]
 
 
 def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
     """Return indices of the two best scores, and of the next best at separate frequencies."""
-    found: list[int] = []
-    for at in best_first(score).tolist():
-        if score[at] <= 0 or len(found) == count:
+    chosen = list[int]()
+    for index in best_first(score).tolist():
+        if score[index] <= 0 or len(chosen) == count:
             break
-        gaps = np.abs(frequencies[found] - frequencies[at])
-        if len(found) < 2 or (gaps >= apart_hz - SAME_FREQUENCY).all():
-            found.append(at)
-    return found
+        distances = np.abs(frequencies[chosen] - frequencies[index])
+        is_apart = (distances >= apart_hz - SAME_FREQUENCY).all()
+        if len(chosen) < 2 or is_apart:
+            chosen.append(index)
+    return chosen
 
 
 def _judged(
     fingers: FingersOnPlate,
     contents: Contents,
-    found: Candidates,
+    candidates: _Candidates,
     ringing: Sequence[RingingUnderFingers | None],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Evaluate m candidates on d drawn plates: level (m,) that 90 % reach, as an amplitude.
-
-    Over a duration, the level is nominal. Also returns the amplitude (m, d) at the targets and the
-    squared amplitude (m, k, d) at the loudest points, scaled to the contents' levels if there are
-    several contents.
-    """
-    drives = [
-        drive if (over := ringing[stream]) is None else over.spectrum(drive)
-        for stream, drive in zip(found.streams.tolist(), found.drives, strict=True)
-    ]
-    parts = [
-        fingers.felt(JUDGING_DRAWS, DriveTones.of(drives[first:][:_BATCH]))
-        for first in range(0, len(drives), _BATCH)
-    ]
-    means = np.concatenate([part for part, _ in parts])
-    loudest = np.concatenate([part for _, part in parts], dtype=float)
-    own, least = np.empty((len(loudest), loudest.shape[2])), np.empty(len(loudest))
+) -> _Judgement:
+    """Evaluate candidates on drawn plates."""
+    drives = list[WeightedTones]()
+    for number, drive in zip(candidates.contents.tolist(), candidates.drives, strict=True):
+        content_ringing = ringing[number]
+        drives.append(drive if content_ringing is None else content_ringing.spectrum(drive))
+    means, loudest = _felt_in_batches(fingers, drives)
+    own = np.empty((len(loudest), loudest.shape[2]))
+    least = np.empty(len(loudest))
     for number, stream in enumerate(contents.streams):
-        of, targets = np.flatnonzero(found.streams == number), [*stream.targets]
-        own[of] = means[of][:, targets].min(axis=1)
-        over, others = ringing[number], contents.others(number)
-        if over is not None and others and not over.envelope.is_course:
-            by_energy = own[of] / np.sqrt(loudest[of][:, others].max(axis=1))
-            order = of[best_first(percentile(by_energy))]
-            loudest[order[IN_TIME:]], some = _TOO_LOUD, order[:IN_TIME]
-            tried = [found.drives[each] for each in some.tolist()]
-            lasting = fingers.felt(JUDGING_DRAWS, DriveTones.of(tried))[0][:, targets, 0].min(
-                axis=1
-            )
-            during = [over.over_drive(drive) for drive in tried]
-            gains = lasting * [each.gains[targets].min() for each in during] / own[some, 0]
-            heard = np.array([each.heard.max(axis=1) for each in during])
-            loudest[some] = on_drawn_plates(loudest[some], heard, gains[:, None, None] ** 2)
-            own[some] *= gains[:, None]
-        least[of] = percentile(own[of, 1:]) if over is None else own[of, 0]
+        indices = np.flatnonzero(candidates.contents == number)
+        own[indices] = means[indices][:, [*stream.targets]].min(axis=1)
+        content_ringing = ringing[number]
+        others = contents.others(number)
+        if content_ringing is None:
+            least[indices] = percentile(own[indices, 1:])
+        else:
+            if others and not content_ringing.envelope.is_course:
+                by_energy = own[indices] / np.sqrt(loudest[indices][:, others].max(axis=1))
+                order = indices[best_first(percentile(by_energy))]
+                loudest[order[IN_TIME:]] = _TOO_LOUD
+                best = order[:IN_TIME]
+                best_drives = [candidates.drives[index] for index in best.tolist()]
+                own[best], loudest[best] = _judged_in_time(
+                    fingers, content_ringing, stream, best_drives, own[best], loudest[best]
+                )
+            least[indices] = own[indices, 0]
         if len(contents.streams) > 1:
-            gain = contents.levels[number] / np.maximum(least[of], _TINY)
-            own[of] *= gain[:, None]
-            loudest[of] *= gain[:, None, None] ** 2
-    return least, own[:, 1:], loudest[:, :, 1:]
+            gain = contents.levels[number] / np.maximum(least[indices], _TINY)
+            own[indices] *= gain[:, None]
+            loudest[indices] *= gain[:, None, None] ** 2
+    return _Judgement(least, own[:, 1:], loudest[:, :, 1:])
 
 
-def best_tone(
-    wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatArray, least: FloatArray
-) -> int:
+def _felt_in_batches(
+    fingers: FingersOnPlate, drives: Sequence[WeightedTones]
+) -> tuple[Float32Array, FloatArray]:
+    """Return mean amplitude over fingertips and power at loudest points, both (m, k, 1 + d)."""
+    means = list[Float32Array]()
+    loudest = list[Float32Array]()
+    for first in range(0, len(drives), _BATCH):
+        batch = DriveTones.of(drives[first : first + _BATCH])
+        batch_means, batch_loudest = fingers.felt(JUDGING_DRAWS, batch)
+        means.append(batch_means)
+        loudest.append(batch_loudest)
+    return np.concatenate(means), np.concatenate(loudest, dtype=float)
+
+
+def _judged_in_time(
+    fingers: FingersOnPlate,
+    ringing: RingingUnderFingers,
+    stream: Stream,
+    drives: Sequence[WeightedTones],
+    own: FloatArray,
+    loudest: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return amplitude (j, 1 + d) at targets and power (j, k, 1 + d) of drives solved in time.
+
+    own, loudest: the same from the drives' energy.
+    """
+    targets = [*stream.targets]
+    steady_means, _ = fingers.felt(JUDGING_DRAWS, DriveTones.of(drives))
+    steady_own = steady_means[:, targets, 0].min(axis=1)
+    sensations = [ringing.over_drive(drive) for drive in drives]
+    least_gains = [sensation.gains[targets].min() for sensation in sensations]
+    gains = steady_own * least_gains / own[:, 0]
+    heard = np.array([sensation.heard.max(axis=1) for sensation in sensations])
+    powers = on_drawn_plates(loudest, heard, gains[:, None, None] ** 2)
+    return own * gains[:, None], powers
+
+
+def best_tone(contents: Contents, scores: FloatArray, judgement: _Judgement) -> int:
     """Choose the candidate of a single content: level first, then contrast.
 
-    Without other fingers, the score counts, and equally a level that varies little among plates.
-    wanted: amplitude relative to the threshold; scores (m,); own (m, d), quiet (m, q, d), least
-    (m,): from `_judged`.
+    Without other fingers, the score (m,) counts, and equally a level that varies little among
+    plates.
     """
-    reaches = least >= wanted * REACHED
+    level = float(contents.levels[0])
+    reaches = judgement.least >= level * REACHED
     if not reaches.any():
         reaches[:] = True
-    if not quiet.shape[1]:
-        return best_of(reaches * scores * least / percentile(own, 50))
-    loud = np.sqrt(quiet.max(axis=1))
-    return best_of(np.where(reaches, percentile(own / np.maximum(loud, 1e-30)), 0.0))
+    if not contents.quiet:
+        steadiness = judgement.least / percentile(judgement.own, 50)
+        return best_of(reaches * scores * steadiness)
+    foreign_power = judgement.loudest[:, [*contents.quiet]].max(axis=1)
+    contrast = judgement.own / np.maximum(np.sqrt(foreign_power), 1e-30)
+    return best_of(np.where(reaches, percentile(contrast), 0.0))
 
 
 def best_combination(
     table: LocalizationTable,
     contents: Contents,
-    found: Candidates,
-    own: FloatArray,
-    loudest: FloatArray,
+    candidates: _Candidates,
+    judgement: _Judgement,
 ) -> tuple[IntArray, bool]:
     """Choose a candidate for each content (K,); also return whether their frequencies are apart.
 
     Contents swap bands if they have several. Combinations with separate frequencies come first;
     others are used only without any.
     """
-    streams, hertz = contents.streams, table.frequencies[found.rows]
-    sensitivities = table.sensitivities[:, found.rows]
-    for gap in (contents.apart_hz, 0.0):
-        combinations = np.flatnonzero(found.streams == 0)[:, None]
+    streams = contents.streams
+    sensitivities = table.sensitivities[:, candidates.rows]
+    for min_distance in (contents.apart_hz, 0.0):
+        combinations = np.flatnonzero(candidates.contents == 0)[:, None]
         for number in range(1, len(streams)):
-            own_candidates = np.flatnonzero(found.streams == number)
-            before = np.repeat(combinations, len(own_candidates), axis=0)
-            last = np.tile(own_candidates, len(combinations))[:, None]
-            gaps = np.abs(hertz[last] - hertz[before])
-            allowed = (gaps >= gap - SAME_FREQUENCY).all(axis=1)
-            if len(streams[0].bands) > 1:
-                allowed &= (found.bands[last] != found.bands[before]).all(axis=1)
-            combinations = np.concatenate([before, last], axis=1)[allowed]
+            combinations = _extended(
+                table, contents, candidates, combinations, number, min_distance
+            )
             if len(combinations) > contents.combinations:
-                some = own[:, ::PRUNING_STEP], loudest[:, :, ::PRUNING_STEP]
-                worst = worst_ratios(combinations, streams, contents.quiet, *some, sensitivities)
+                worst = worst_ratios(
+                    combinations,
+                    streams,
+                    contents.quiet,
+                    judgement.own[:, ::PRUNING_STEP],
+                    judgement.loudest[:, :, ::PRUNING_STEP],
+                    sensitivities,
+                )
                 combinations = combinations[best_few(worst, contents.combinations)]
         if len(combinations):
-            worst = worst_ratios(combinations, streams, contents.quiet, own, loudest, sensitivities)
-            return combinations[best_of(worst)], gap == contents.apart_hz
+            worst = worst_ratios(
+                combinations,
+                streams,
+                contents.quiet,
+                judgement.own,
+                judgement.loudest,
+                sensitivities,
+            )
+            return combinations[best_of(worst)], min_distance == contents.apart_hz
     raise AssertionError("contents with as many bands must have a combination")
+
+
+def _extended(
+    table: LocalizationTable,
+    contents: Contents,
+    candidates: _Candidates,
+    combinations: IntArray,
+    number: int,
+    min_distance: float,
+) -> IntArray:
+    """Extend combinations (c, j) by each candidate of the next content, in all allowed ways.
+
+    min_distance: of their frequencies [Hz].
+    """
+    frequencies = table.frequencies[candidates.rows]
+    next_candidates = np.flatnonzero(candidates.contents == number)
+    earlier = np.repeat(combinations, len(next_candidates), axis=0)
+    last = np.tile(next_candidates, len(combinations))[:, None]
+    distances = np.abs(frequencies[last] - frequencies[earlier])
+    is_allowed = (distances >= min_distance - SAME_FREQUENCY).all(axis=1)
+    if len(contents.streams[0].bands) > 1:
+        is_allowed &= (candidates.bands[last] != candidates.bands[earlier]).all(axis=1)
+    return np.concatenate([earlier, last], axis=1)[is_allowed]
 
 
 def worst_ratios(
@@ -546,18 +562,19 @@ def worst_ratios(
     The lowest over the threshold sets, with sensitivities (s, m). Only the first j contents play;
     own (m, d), loudest (m, k, d): from `_judged`.
     """
-    least = np.full(len(combinations), np.inf)
+    worst_of_sets = np.full(len(combinations), np.inf)
     for factors in sensitivities.astype(float):
         power = loudest * np.square(factors)[:, None, None]
         levels = (own * factors[:, None])[combinations] ** 2
         total = power[combinations].sum(axis=1)
         worst = np.full((len(combinations), own.shape[1]), np.inf)
-        for j, at in enumerate(combinations.T):
-            if combinations.shape[1] > 1:
-                for finger in streams[j].targets:
-                    others_power = np.maximum(total[:, finger] - power[at, finger], _TINY)
-                    worst = np.minimum(worst, levels[:, j] / others_power)
+        if combinations.shape[1] > 1:
+            for number, candidate in enumerate(combinations.T):
+                for finger in streams[number].targets:
+                    foreign_power = np.maximum(total[:, finger] - power[candidate, finger], _TINY)
+                    worst = np.minimum(worst, levels[:, number] / foreign_power)
         for finger in quiet:
-            worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
-        least = np.minimum(least, percentile(worst))
-    return least
+            foreign_power = np.maximum(total[:, finger], _TINY)
+            worst = np.minimum(worst, levels.min(axis=1) / foreign_power)
+        worst_of_sets = np.minimum(worst_of_sets, percentile(worst))
+    return worst_of_sets

@@ -22,14 +22,19 @@ from model.compiled.versions import Version, versions
 
 FOUND, NO_MEMORY = 0, -1
 
-_TYPES = {"i": np.int32, "f": np.float32, "c": np.complex64}
-"""Types of arrays for kernels, by numpy's kind: integers, real and complex numbers."""
+_ARRAY_TYPES = {"i": np.int32, "f": np.float32, "c": np.complex64}
+"""Element types of the kernels' arrays by numpy's kind: integers, real and complex numbers."""
+
+_FIELD_TYPES = {"i": c_int, "f": c_float, "d": c_double, "p": c_void_p}
+"""Types of the fields of structures: integers, floats, doubles, pointers."""
 
 
-def _fields(**names: str) -> list[tuple[str, Any]]:
-    """Make fields from names by kind: i: integers, f: floats, d: doubles, p: pointers."""
-    kinds = {"i": c_int, "f": c_float, "d": c_double, "p": c_void_p}
-    return [(name, kinds[kind[0]]) for kind, all_ in names.items() for name in all_.split()]
+def _fields(**names_by_type: str) -> list[tuple[str, Any]]:
+    """Return the fields of a structure; each argument lists names of a type of `_FIELD_TYPES`."""
+    fields = []
+    for letter, names in names_by_type.items():
+        fields += [(name, _FIELD_TYPES[letter]) for name in names.split()]
+    return fields
 
 
 class Structure(ctypes.Structure):
@@ -37,19 +42,19 @@ class Structure(ctypes.Structure):
 
     arrays: list[NDArray[Any]]
 
-    def point(self, **given: NDArray[Any] | None) -> None:
+    def point(self, **arrays: NDArray[Any] | None) -> None:
         """Set pointers to arrays, which are converted for kernels; None leaves a null pointer."""
         self.arrays = [*getattr(self, "arrays", [])]
-        for name, array in given.items():
-            if array is not None:
-                kept = as_given(array)
-                self.arrays.append(kept)
-                setattr(self, name, kept.ctypes.data)
+        for field, values in arrays.items():
+            if values is not None:
+                array = as_given(values)
+                self.arrays.append(array)
+                setattr(self, field, array.ctypes.data)
 
 
 def as_given(values: NDArray[Any]) -> NDArray[Any]:
     """Convert values for kernels: contiguous, in single precision or integers of 32 bits."""
-    return np.ascontiguousarray(values, dtype=_TYPES[values.dtype.kind])
+    return np.ascontiguousarray(values, dtype=_ARRAY_TYPES[values.dtype.kind])
 
 
 class TouchedPlates(Structure):
@@ -160,10 +165,10 @@ KERNEL_FOLDER = Path(__file__).parent
 def processor_features() -> AbstractSet[str]:
     """Return the features of this processor by numpy's names; empty if numpy does not tell."""
     try:
-        known = import_module("numpy._core._multiarray_umath").__cpu_features__
+        availability = import_module("numpy._core._multiarray_umath").__cpu_features__
     except (ImportError, AttributeError):  # not a public interface
         return frozenset()
-    return {name for name, has in known.items() if has}
+    return {feature for feature, is_available in availability.items() if is_available}
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,11 +221,13 @@ def arithmetic() -> str:
     return f"answers are computed by C kernels ({loaded.version})"
 
 
-def run_kernel(kernel: Callable[..., int], *given: Any) -> int:
+def run_kernel(kernel: Callable[..., int], *arguments: Any) -> int:
     """Run a kernel on structures and other arguments and return its status; raises MemoryError."""
-    status = kernel(
-        *[ctypes.byref(each) if isinstance(each, ctypes.Structure) else each for each in given]
-    )
+    converted = []
+    for argument in arguments:
+        is_structure = isinstance(argument, ctypes.Structure)
+        converted.append(ctypes.byref(argument) if is_structure else argument)
+    status = kernel(*converted)
     if status == NO_MEMORY:
         raise MemoryError("kernels could not get the memory that an answer takes")
     return status

@@ -1,4 +1,4 @@
-/* Memory of one call: taken piece by piece, given back to a mark or all at the end. */
+/* Memory of one kernel call: a stack of chunks, released down to a mark or completely. */
 #ifndef ARENA_H
 #define ARENA_H
 
@@ -17,13 +17,13 @@ typedef struct chunk {
 typedef struct {
     chunk *last;
     char *at;
-    jmp_buf *failed; /* where to go without memory */
+    jmp_buf *failed; /* jump target when memory runs out */
 } arena;
 
 static __attribute__((unused)) void *take(arena *from, size_t bytes) {
     bytes = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
     if (!from->last || (size_t)(from->last->end - from->at) < bytes) {
-        /* Each twice the one before: what was once given back is kept by the C library. */
+        /* Each chunk is twice as large as the previous one, since the C library keeps freed memory for reuse. */
         size_t before = from->last ? (size_t)(from->last->end - (char *)from->last) : CHUNK / 2;
         size_t size = ALIGNMENT + bytes > 2 * before ? ALIGNMENT + bytes : 2 * before;
         void *more;
@@ -42,7 +42,7 @@ INLINE float *floats(arena *from, size_t count) { return take(from, count * size
 
 INLINE int *integers(arena *from, size_t count) { return take(from, count * sizeof(int)); }
 
-/* Give back all that was taken since a copy of the arena was made. */
+/* Release everything allocated since the arena was copied to `mark`. */
 static __attribute__((unused)) void release(arena *of, arena mark) {
     while (of->last != mark.last) {
         chunk *more = of->last;

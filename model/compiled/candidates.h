@@ -1,17 +1,18 @@
-/* Tones worth judging: frequencies that are ranked first, and the best tones of each content. */
+/* Candidate tones: a ranking of the frequencies, then the best tones of each content. */
 #ifndef CANDIDATES_H
 #define CANDIDATES_H
 
 #include "answer.h"
 
-/* Tones (count) of contents in bands; rows: of the table; weights (count, n). */
+/* Candidates (count): content, band and table row of each, its score, and its weights (count, n). */
 typedef struct {
     int count;
     int *content, *band, *rows;
     float *scores, *weights;
 } candidates;
 
-/* What is found at rows (count): the best score, that of what misses the level, and weights (count, n). */
+/* Search results at rows (count): best score, best score of weights that miss the level, upper bound, and weights
+ * (count, n). */
 typedef struct {
     float *score, *missed, *bound, *weights;
 } rows_found;
@@ -25,7 +26,7 @@ INLINE void rows_at(int *rows, const int *all, int first, int count) {
     for (int l = 0; l < LANES; l++) rows[l] = all[first + l < count ? first + l : count - 1];
 }
 
-/* Which fingers are protected from a content: how many. */
+/* Mark the fingers that a content must not reach; return their number. */
 SHARED size_t find_others(char *is_other, const question *of, size_t content, size_t k) {
     memset(is_other, 0, k);
     for (int i = 0; i < of->quiet_count; i++) is_other[of->quiet[i]] = 1;
@@ -36,7 +37,8 @@ SHARED size_t find_others(char *is_other, const question *of, size_t content, si
     return count;
 }
 
-/* Indices (at most kept) of the frequencies of the highest bounds for one target, ascending, by one form of all others. */
+/* Find the rows with the highest bounds for a single target, ascending, at most `kept`; return their number. The
+ * bounds are computed from one form of all other fingers together. */
 SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, const question *of, arena *memory) {
     const size_t n = on->n, k = on->k;
     const arena mark = *memory;
@@ -79,7 +81,7 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
     best_first(order, at.bound, count, memory);
     char *is_kept = take(memory, count);
     for (int i = 0; i < count; i++) is_kept[i] = 0;
-    /* First those that would be better than the best, were they loud enough. */
+    /* First the rows that would beat the best one if they reached the level. */
     for (int i = 0; i < count && missing < by->missing && at.score[order[i]] <= 0; i++) is_kept[order[i]] = 1, missing++;
     for (int i = 0; i < count && reaching < by->kept - missing; i++)
         if (at.score[order[i]] > 0) is_kept[order[i]] = 1, reaching++;
@@ -90,19 +92,20 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
     return kept;
 }
 
-/* Rows (count, n) of ERAs of a group alone. */
+/* Clear the entries of ERAs outside a group in rows (count, n). */
 INLINE void among(value *rows, size_t count, const int *group, int own, size_t n) {
     for (size_t i = 0; i < count * n; i++)
         if (group[i % n] != own) rows[i] = ZERO;
 }
 
-/* Form (n, n) of ERAs of a group alone, each other with its own power. */
+/* Clear the off-diagonal entries of ERAs outside a group in a form (n, n). */
 INLINE void form_among(value *form, const int *group, int own, size_t n) {
     for (size_t i = 0; i < n * n; i++)
         if (i / n != i % n && (group[i / n] != own || group[i % n] != own)) form[i] = ZERO;
 }
 
-/* A content's forms at LANES rows: by point of each other finger, or by their mean; of a group of ERAs. */
+/* Return the search problem of a content at LANES rows for a group of ERAs. by_point: other fingers count by their rim
+ * points instead of by their mean. */
 SHARED searched forms_of(const formed *found, const plates *on, const rules *by, const question *of, const int *rows,
                          size_t content, int group, int by_point, float level, float margin, arena *memory) {
     const size_t n = on->n, k = on->k, first = of->starts[content], count = of->starts[content + 1] - first;
@@ -119,7 +122,7 @@ SHARED searched forms_of(const formed *found, const plates *on, const rules *by,
                 const float share = of->few_weights[finger * of->few + i];
                 mean[e].re += share * from.re, mean[e].im += share * from.im;
             }
-        /* What the field differs over a target is no uncertainty of its level. */
+        /* The variation of the field over a target does not make its level uncertain. */
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++)
                 expected_power[(t * n + u) * n + v] =
@@ -176,8 +179,8 @@ INLINE float highest_score(const float *scores, int first, int end) {
     return found;
 }
 
-/* At rows from a first to an end: the best weights, brought within full stroke where only that reaches the level.
- * Whether weights of a better score were found at a row where none reach it. */
+/* Search rows `first` to `end` for the best weights. Rows that miss the level are searched again with methods that
+ * limit weights to full stroke. Return whether a row that misses the level would still score best. */
 SHARED int search_rows(rows_found *to, searched *blocks, const rules *by, int first, int end, arena *memory) {
     const size_t n = blocks[first / LANES].n;
     const arena mark = *memory;
@@ -220,7 +223,7 @@ SHARED int search_rows(rows_found *to, searched *blocks, const rules *by, int fi
     return limited;
 }
 
-/* The highest amplitude to threshold at the weakest target, of rows from a first to an end. */
+/* Return the highest amplitude at the weakest target, relative to the threshold, over rows `first` to `end`. */
 SHARED float highest_level(searched *blocks, const rules *by, const int *all, int count, int first, int end, arena *memory) {
     const arena mark = *memory;
     best found = {.weights = values(memory, blocks[first / LANES].n), .score = ZERO.re, .missed = ZERO.re,
@@ -240,7 +243,7 @@ SHARED float highest_level(searched *blocks, const rules *by, const int *all, in
     return highest;
 }
 
-/* The best tones of a content in a band: the two best scores, and the best apart from all of these. */
+/* Append a content's candidates in a band: the two best scores, then the best ones at separate frequencies. */
 SHARED void keep_apart(candidates *to, const rows_found *found, const rules *by, const question *of, int content, int band,
                        const int *rows, int first, int end, size_t n, arena *memory) {
     const arena mark = *memory;
@@ -261,7 +264,7 @@ SHARED void keep_apart(candidates *to, const rows_found *found, const rules *by,
     release(memory, mark);
 }
 
-/* The best tones of every content in each of its bands, at rows (count); whether a level was hard to reach. */
+/* Find the candidates of all contents in all bands, at rows (count); return whether a level was hard to reach. */
 SHARED int find_candidates(candidates *to, const plates *on, const rules *by, const question *of, const int *rows, int count,
                            arena *memory) {
     const size_t n = on->n, k = on->k;
@@ -295,13 +298,14 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
             const int others = (int)find_others(is_other, of, content, k), before = to->count;
             const int ways = others > 0 && others <= by->max_by_point ? 2 : 1;
             const arena mark = *memory;
-            /* Of several groups those that reach the level, or else any. */
+            /* First only groups of ERAs that reach the level; if none does, all groups. */
             for (int is_any = by->groups == 1; is_any < 2 && to->count == before; is_any++)
                 for (int group = 0; group < by->groups; group++) {
                     const int start = to->count;
                     float level = of->level[content] * (float)of->contents, margin = by->margin;
                     for (int way = 0; way < ways && (!way || to->count > start); way++) {
-                        for (int tries = 0;; tries++) { /* without the margin where that must be, or else near the highest level */
+                        for (int tries = 0;; tries++) { /* with the margin, then without it, then near the highest
+                                                         * level */
                             int some[LANES];
                             for (int block = first / LANES; block * LANES < end; block++) {
                                 rows_at(some, rows, block * LANES, count);

@@ -1,4 +1,4 @@
-/* Choices that rounding cannot turn, as of `model.arrays`, and percentiles. */
+/* Choices that do not depend on rounding (as in `model.arrays`), and percentiles. */
 #ifndef CHOICE_H
 #define CHOICE_H
 
@@ -22,7 +22,7 @@ static int by_run(const void *one, const void *other) {
     return a->run != b->run ? a->run - b->run : a->at - b->at;
 }
 
-/* order (count) of scores, the highest first; of those nearly equal the first one first. */
+/* Sort scores (count), highest first; nearly equal scores keep their order. */
 SHARED void best_first(int *order, const float *scores, int count, arena *memory) {
     const arena mark = *memory;
     ranked *each = take(memory, count * sizeof(ranked));
@@ -38,7 +38,7 @@ SHARED void best_first(int *order, const float *scores, int count, arena *memory
     release(memory, mark);
 }
 
-/* Index of the first of the highest scores. */
+/* Return the index of the first of the nearly highest scores. */
 INLINE int best_of(const float *scores, int count) {
     float highest = scores[0];
     for (int i = 1; i < count; i++) highest = scores[i] > highest ? scores[i] : highest;
@@ -49,7 +49,7 @@ INLINE int best_of(const float *scores, int count) {
 
 enum { FEW = 24 };
 
-/* The value of a rank of values (count), whose order is lost; those before it are no larger. */
+/* Return the value of a rank among values (count) by partial sorting (quickselect); reorders the values. */
 SHARED float of_rank(float *values, int count, int rank) {
     int low = 0, high = count - 1;
     while (low < high) {
@@ -70,7 +70,7 @@ SHARED float of_rank(float *values, int count, int rank) {
     return values[rank];
 }
 
-/* The value of a low rank of values (count), and the next one, of the few lowest, kept in order. */
+/* Find the value of a low rank among values (count) and the next higher one, by sorting only the lowest values. */
 INLINE void of_low_rank(float *below, float *above, const float *values, int count, int rank) {
     float lowest[FEW + 1];
     const int kept = rank + 2 < count ? rank + 2 : count;
@@ -84,7 +84,7 @@ INLINE void of_low_rank(float *below, float *above, const float *values, int cou
     *below = lowest[rank], *above = lowest[rank + 1 < kept ? rank + 1 : rank];
 }
 
-/* Percentile of values (count), linear between them; their order is lost. */
+/* Return a percentile of values (count) with linear interpolation; reorders the values. */
 SHARED float percentile(float *values, int count, float percent) {
     double place = (double)percent / 100 * (count - 1);
     int low = (int)place;

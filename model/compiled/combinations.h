@@ -1,11 +1,11 @@
-/* Combinations of ERAs that move some fingers most. */
+/* Combinations of ERAs that move certain fingers most. */
 #ifndef COMBINATIONS_H
 #define COMBINATIONS_H
 
 #include "rows.h"
 
-/* Columns of orthonormal combinations (combinations, eras): the amplitudes, and the vectors of the largest eigenvalues of
- * the form of all rows and knots of `felt`, by Jacobi's rotations of pairs of columns. */
+/* Return orthonormal combinations (combinations, eras): first the amplitudes, then the eigenvectors of the largest
+ * eigenvalues of the form of all rows and knots of `felt`. Eigenvectors are computed by one-sided Jacobi rotations. */
 static matrix strongest(const double *amplitudes, size_t n, size_t count, const matrix *felt, size_t rows, size_t span, arena *memory) {
     const size_t width = whole(n);
     const matrix made = zeros(count, width, memory), form = zeros(n, width, memory), own = zeros(n, width, memory);
@@ -18,7 +18,7 @@ static matrix strongest(const double *amplitudes, size_t n, size_t count, const 
                 for (size_t k = 0; k < span; k += LANES)
                     found = add_conjugate_product(found, at(felt, row * felt->width + e * span + k),
                                                   at(felt, row * felt->width + f * span + k));
-            const float re = sum(found.re), im = sum(found.im); /* of row e and column f: columns lie in rows here */
+            const float re = sum(found.re), im = sum(found.im); /* entry (e, f) of the form */
             form.re[f * width + e] = form.re[e * width + f] = re;
             form.im[f * width + e] = im, form.im[e * width + f] = -im;
             trace += e == f ? re : 0;

@@ -1,9 +1,10 @@
-/* From fingers to the tones of all their contents and what they promise: `model.answer.stimulus` in C. */
+/* The kernel `answer`: chooses tones for all contents and computes their promises. Reference:
+ * `model.answer.tone_search`. */
 #include "candidates.h"
 #include "promise.h"
 
-/* What candidates do on the plates that judge: amplitude at their targets (count, draws), at a gain to the level if
- * there are several contents, and power at the loudest point of each finger (count, k, draws). */
+/* Evaluate candidates on the drawn plates: amplitude at the weakest target (count, draws), and power at the loudest
+ * point of each finger (count, k, draws). */
 SHARED void judge(float *own, float *loudest, const candidates *from, const plates *on, const rules *by,
                   const question *of, const float *columns, arena *memory) {
     const draws *draws = of->judging;
@@ -45,7 +46,7 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
     }
 }
 
-/* Index of the tone of an only content that drawn plates prefer: level first, then contrast. */
+/* Return the index of the best candidate of a single content: level first, then contrast. */
 SHARED int best_tone(const candidates *from, const float *own, const float *loudest, const plates *on, const rules *by,
                      const question *of, arena *memory) {
     const int count = from->count, draws = of->judging->count;
@@ -78,13 +79,15 @@ SHARED int best_tone(const candidates *from, const float *own, const float *loud
     return chosen_tone;
 }
 
-/* What tones do on some of the plates that judge, as powers by one set of thresholds: (count, draws), (count, k, draws). */
+/* Powers of candidates on drawn plates relative to one threshold set: at the targets (count, draws), and at the
+ * loudest points of fingers (count, k, draws). */
 typedef struct {
     size_t draws;
     const float *own, *loudest;
 } judged;
 
-/* By each set (sets), on every so many of the plates, of amplitudes at targets and powers by the first set. */
+/* Return the powers of candidates for each threshold set (sets), on every step-th drawn plate. own, loudest: from
+ * `judge`, for the first threshold set. */
 SHARED judged *by_sets(const float *own, const float *loudest, size_t plates, const candidates *from, size_t k, size_t step,
                        const rules *by, arena *memory) {
     const size_t draws = (plates + step - 1) / step, count = from->count, room = count * draws + LANES;
@@ -105,7 +108,7 @@ SHARED judged *by_sets(const float *own, const float *loudest, size_t plates, co
     return found;
 }
 
-/* The least power ratio of a combination (contents) at any finger, of the first contents, on LANES plates. */
+/* Return the power ratio at the worst finger of a combination of the first contents, on LANES plates. */
 INLINE lanes least_ratio(const int *tone, size_t contents, const judged *on, size_t from, const int *content_of,
                          size_t fingers, const question *of) {
     const size_t draws = on->draws;
@@ -124,8 +127,9 @@ INLINE lanes least_ratio(const int *tone, size_t contents, const judged *on, siz
     return least;
 }
 
-/* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents, the least over
- * the sets (on). LANES combinations at once, of which the lowest ratios are kept in order. */
+/* Compute worst (count): the judged percentile of the worst power ratio of combinations (count, contents) of the first
+ * contents, and of that the lowest over the threshold sets (on). Processes LANES combinations together, and keeps
+ * their lowest ratios sorted. */
 SHARED void worst_ratios(float *worst, const int *combinations, int count, size_t contents, const judged *on,
                          const int *content_of, size_t fingers, const rules *by, const question *of, arena *memory) {
     const size_t draws = on->draws;
@@ -157,11 +161,13 @@ SHARED void worst_ratios(float *worst, const int *combinations, int count, size_
     release(memory, mark);
 }
 
-/* A tone of each content, of all combinations that exchange bands and are apart, else of all that exchange bands. */
+/* Choose a candidate for each content. Combinations with separate frequencies come first, others only without any.
+ * Return whether the frequencies are separate, or -1 without a combination. */
 SHARED int best_combination(int *chosen_tones, const candidates *from, const float *own, const float *loudest,
                             const plates *on, const rules *by, const question *of, arena *memory) {
     const int contents = of->contents, most = of->combinations;
-    const size_t each = (size_t)of->bands * by->groups * 2 * of->candidates; /* tones of a content */
+    const size_t each = (size_t)of->bands * by->groups * 2 * of->candidates; /* largest number of candidates of a
+                                                                              * content */
     const size_t room = each > (size_t)most ? each : (size_t)most;
     const arena mark = *memory;
     int *content_of = integers(memory, on->k), *kept = integers(memory, room * contents);
@@ -192,7 +198,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
                     tried[(size_t)found++ * contents + j] = tone;
                 }
             count = found;
-            if (j && count > most) { /* a content alone has no ratio to others */
+            if (j && count > most) { /* a single content has no ratio to others */
                 worst_ratios(worst, tried, count, j + 1, few, content_of, on->k, by, of, memory);
                 best_first(order, worst, count, memory);
                 count = most;
@@ -211,7 +217,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
     return -1;
 }
 
-/* Bring each candidate to its content's level on the plates that judge. */
+/* Scale each candidate to its content's level on the judged share of drawn plates. */
 INLINE void bring_to_level(float *own, float *loudest, const candidates *from, size_t k, const rules *by,
                            const question *of, arena *memory) {
     const size_t draws = of->judging->count;
@@ -240,7 +246,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
                        .weights = floats(memory, 2 * most * n)};
     int is_limited = find_candidates(&from, on, by, of, rows, count, memory);
     if (count < of->rows && (!from.count || is_limited) && of->is_ranked) {
-        from.count = 0; /* among all frequencies */
+        from.count = 0; /* search all frequencies */
         is_limited = find_candidates(&from, on, by, of, of->row, of->rows, memory);
     }
     if (!from.count) return NOT_REACHED;
@@ -264,7 +270,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     return FOUND;
 }
 
-/* Rows that any band holds, and bands counted among these. */
+/* List the rows in any band, and convert the limits of bands to indices in this list. */
 SHARED void find_rows(question *of, const int *bands, arena *memory) {
     const int ends = of->contents * of->bands * 2;
     int most = 0;
@@ -315,7 +321,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     return status;
 }
 
-/* FOUND, NOT_REACHED where nothing is felt at all, or NO_MEMORY. */
+/* Return FOUND, NOT_REACHED if no tone can be felt, or NO_MEMORY. */
 int answer(results *to, const plates *on, const raster *read, const rules *by, const asked *of) {
     arena memory = {.last = NULL};
     const int status = guarded(to, on, read, by, of, &memory);

@@ -1,49 +1,50 @@
-/* Tones on the nominal plate and on drawn ones: `model.ensemble.touched_plate.TouchedPlate.drawn` in C. */
+/* Tones on the nominal plate and on drawn plates. Reference: `model.ensemble.touched_plate.TouchedPlate.drawn`. */
 #ifndef DRAWN_H
 #define DRAWN_H
 
 #include "points.h"
 
-/* Plates in the order of their thicknesses; width: floats of a row, a register more than plates. */
+/* Drawn plates, ordered by thickness. The rows of arrays have `width` floats, a register more than there are plates. */
 typedef struct {
-    int count, bases, nodes, width; /* plates; thicknesses of changes; thicknesses of plates */
-    int first_base, first_node;     /* of these by index among those of the plate */
-    int amplifiers;                 /* whose clocks are off; 0 for none */
-    const int *node;                /* (count) */
-    const float *loss, *damping;    /* (width) */
-    const float *own, *gains;       /* (a, width); (2, a, width) real and imaginary parts */
-    const float *errors;            /* (2, k, width) */
+    int count, bases, nodes, width; /* plates; thicknesses at which changes are computed; thicknesses of plates */
+    int first_base, first_node;     /* number of the first of each among the table's thicknesses */
+    int amplifiers;                 /* amplifiers with clock errors; 0 without errors */
+    const int *node;                /* (count) thickness of each plate */
+    const float *loss, *damping;    /* (width) changes per plate */
+    const float *own, *gains;       /* (a, width) own stiffness; (2, a, width) gain errors, real and imaginary parts */
+    const float *errors;            /* (2, k, width) field errors at fingers, real and imaginary parts */
     const float *harmonics;         /* (2, n, width) second harmonics of ERAs, relative to their motion */
     const float *delays;            /* (amplifiers, width) [s] */
-    const int *amplifier;           /* (n) of each ERA */
+    const int *amplifier;           /* (n) amplifier of each ERA */
 } draws;
 
-/* Points of all fingers, and what tones at them are measured by. */
+/* Points under all fingers, and the errors and thresholds by frequency. */
 typedef struct {
     int points;
-    const float *rows, *weights;     /* (points, r); (points) in the mean over each fingertip */
-    const float *error, *threshold;  /* (f, n) mean square of each ERA's error; (f) */
+    const float *rows, *weights;     /* (points, r); (points) weight in the mean over the fingertip */
+    const float *error, *threshold;  /* (f, n) mean square error per ERA; (f) */
 } sensors;
 
-/* Tones (m), whose changes are those at some thicknesses (bases). */
+/* Tones (m) at the points: fields at all thicknesses, and linear changes at a few of them (bases). */
 typedef struct {
     const plates *on;
     const draws *by;
     const sensors *at;
     size_t m, padded;
     const int *rows;
-    float *error;      /* (m) */
-    float *at_nodes;   /* (m, 1 + nodes, points), the nominal one first */
-    float *by_force;   /* (m, bases, 2, a + 1, padded): real and imaginary parts; by the loss factor last */
-    float *forces;     /* (m, bases, 4, a): by loss, damping, own stiffness, and gain */
+    float *error;      /* (m) root mean square error */
+    float *at_nodes;   /* (m, 1 + nodes, points) fields, the nominal thickness first */
+    float *by_force;   /* (m, bases, 2, a + 1, padded) change of the field per force, and last per loss factor; real
+                        * and imaginary parts */
+    float *forces;     /* (m, bases, 4, a) forces per loss, damping, own stiffness and gain */
 } tones;
 
 INLINE size_t groups_of(const draws *by) { return by->count / by->bases / LANES + (by->count / by->bases % LANES > 0); }
 
-/* Groups of LANES plates, of which the first is the nominal plate alone. */
+/* Number of groups of LANES plates; the first group is the nominal plate alone. */
 INLINE size_t group_count(const draws *by) { return 1 + by->bases * groups_of(by); }
 
-/* Which plates, from the nominal one on, are in a group; how many. */
+/* Find the first plate of a group, where plate 0 is the nominal one; return the number of plates in the group. */
 INLINE size_t plates_of(const draws *by, size_t group, size_t *first) {
     const size_t each = by->count / by->bases, groups = groups_of(by);
     if (!group) return *first = 0, 1;
@@ -52,7 +53,7 @@ INLINE size_t plates_of(const draws *by, size_t group, size_t *first) {
     return each - from < LANES ? each - from : LANES;
 }
 
-/* Drives (n) at weights, the fingers' motions (k) by them. */
+/* Compute the forces of ERAs at weights w, and the resulting accelerations of the fingers (k). */
 INLINE void driven(value *forces, value *fingers, const value *drives, const value *w, const touched *of,
                    const plates *on) {
     const size_t n = on->n, b = on->b, k = on->k;
@@ -65,7 +66,7 @@ INLINE void driven(value *forces, value *fingers, const value *drives, const val
     }
 }
 
-/* Accelerations (count, points) in cases of tones by weights (m, n). */
+/* Compute the accelerations at the points for each tone and thickness, with weights (m, n). */
 SHARED void find_at_nodes(tones *to, const float *weights, arena *memory) {
     const plates *on = to->on;
     const size_t n = on->n, b = on->b, k = on->k, r = on->r, each = 1 + to->by->nodes, points = to->at->points;
@@ -88,7 +89,7 @@ SHARED void find_at_nodes(tones *to, const float *weights, arena *memory) {
         driven(forces, held, drives, w, &of, on);
         for (size_t i = 0; i < k; i++) held[i] = times(of.D[i], held[i]);
 
-        /* Forces of the ERAs and of the fingers, and what the ERAs add to these. */
+        /* Total forces at attachments: of the ERAs, and of the attachments that the fingers move. */
         for (size_t j = 0; j < b; j++) {
             value sum = ZERO;
             for (size_t i = 0; i < k; i++) sum = add_product(sum, held[i], of.at[i * b + j]);
@@ -111,8 +112,8 @@ SHARED void find_at_nodes(tones *to, const float *weights, arena *memory) {
     release(memory, mark);
 }
 
-/* Forces (4, a) that a standard deviation of loss, damping, own stiffness and gain adds at attachments and
- * fingers, and the reduced coordinates (r) by the loss factor beside those. */
+/* Compute the forces (4, a) at attachments and fingers per standard deviation of loss, damping, own stiffness and
+ * gain, and the reduced coordinates (r) that the loss factor changes directly. */
 INLINE void find_changes(value *forces, value *lost, const touched *of, const plates *on, const int *rows,
                          const int *cases, const value *w, arena *memory) {
     const size_t n = on->n, b = on->b, k = on->k, a = b + k, r = on->r;
@@ -167,7 +168,7 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
     release(memory, mark);
 }
 
-/* What tones change by, of weights (m, n); columns as of `columns_of`. */
+/* Compute the changes of tones with weights (m, n). columns: from `columns_of`. */
 SHARED void find_by_force(tones *to, const float *columns, const float *weights, arena *memory) {
     const plates *on = to->on;
     const size_t n = on->n, a = on->b + on->k, r = on->r, bases = to->by->bases, cases_in_all = to->m * bases;
@@ -196,7 +197,7 @@ SHARED void find_by_force(tones *to, const float *columns, const float *weights,
     release(memory, mark);
 }
 
-/* Tones at rows (m) of weights (m, n). */
+/* Return the fields and changes of tones at rows (m) with weights (m, n). */
 SHARED tones respond(const plates *on, const draws *by, const sensors *at, const float *columns, size_t m,
                      const int *rows, const float *weights, arena *memory) {
     const size_t n = on->n, a = on->b + on->k, padded = padded_to(at->points + on->k), cases = m * by->bases;
@@ -220,14 +221,14 @@ SHARED tones respond(const plates *on, const draws *by, const sensors *at, const
 /* exp(-i phase). */
 INLINE value late_by(lanes phase) {
     const lanes turns = phase * 0.15915494f, rounder = filled(12582912);
-    const lanes x = (turns - (turns + rounder - rounder)) * 1.5707963f, s = x * x; /* of a quarter of the phase */
+    const lanes x = (turns - (turns + rounder - rounder)) * 1.5707963f, s = x * x; /* a quarter of the phase */
     const lanes cosine = 1 + s * (-1 / 2.f + s * (1 / 24.f + s * (-1 / 720.f + s * (1 / 40320.f))));
     const lanes sine = x * (1 + s * (-1 / 6.f + s * (1 / 120.f + s * (-1 / 5040.f + s * (1 / 362880.f)))));
     const value quarter = {.re = cosine, .im = -sine}, half = times(quarter, quarter);
     return times(half, half);
 }
 
-/* sensed (points): squared amplitudes to threshold of a tone on a group of plates. */
+/* Compute sensed (points): squared amplitudes of a tone relative to the threshold, on a group of plates. */
 SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, value *found, value *force) {
     const draws *by = of->by;
     const size_t a = of->on->b + of->on->k, points = of->at->points, k = of->on->k, width = by->width, padded = of->padded;
@@ -263,7 +264,7 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
     }
     force[a] = (value){.re = by_loss, .im = ZERO.im};
     for (size_t i = 0; i < points; i += 4) {
-        const size_t last = points - 1 - i; /* padded points are read, and not kept */
+        const size_t last = points - 1 - i; /* padded points are read but not stored */
         value s0 = found[i], s1 = found[i + (last > 0)], s2 = found[i + (last > 1 ? 2 : 0)], s3 = found[i + (last > 2 ? 3 : 0)];
         for (size_t j = 0; j <= a; j++) {
             value f = force[j];

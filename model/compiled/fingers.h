@@ -1,31 +1,32 @@
-/* Fingers on plates without ERAs: `model.ensemble.touched_plate` in C, whose symbols are used. */
+/* Fingers on the plate. Reference, also for the symbols: `model.ensemble.touched_plate`. */
 #ifndef FINGERS_H
 #define FINGERS_H
 
 #include "lanes.h"
 
 typedef struct {
-    int n, b, k, r, t;          /* ERAs; these and masses; fingers; reduced coordinates; thicknesses */
-    int off;                    /* ERAs, and masses up to the last foot whose stiffness deviates */
+    int n, b, k, r, t;          /* ERAs; attachments (ERAs and masses); fingers; reduced coordinates; thicknesses */
+    int off;                    /* ERAs, and masses up to the last foot with uncertain stiffness */
     int rows, lanes, kept;      /* frequencies; lanes and thicknesses of the blocks below */
     const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
     const float *by_damping, *by_stiffness;                /* (f, n), (f, off) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
-    const float *centres, *stiffness, *load_std;           /* (k, r); (f, k) D; (k) of its logarithm */
-    value *of_blocks; /* (blocks of LANES frequencies, the first thicknesses, b, r) T, as `load` gives it */
+    const float *centres, *stiffness, *load_std;           /* (k, r); (f, k) D; (k) standard deviation of its logarithm */
+    value *of_blocks; /* (blocks of LANES frequencies, first thicknesses, b, r) T, as loaded by `load` */
 } plates;
 
-/* Some cases, each of a frequency and a thickness, with the fingers on them. */
+/* LANES cases (a frequency and a thickness each) with the fingers on the plate. */
 typedef struct {
     const value *T;          /* (b, r) */
     value *g, *Y;            /* (r), (b, b) */
-    value *at;               /* (k, b) accelerations of the fingers by a force at each attachment, without them */
-    value *resting, *P, *D;  /* (k, b) the same with them; (k, k) (1 + G D)^-1, (k) */
-    value *G;                /* (k, k) displacement of the fingers by a force at each, without the others */
+    value *at;               /* (k, b) accelerations at the fingers per force at an attachment, without the fingers'
+                              * load */
+    value *resting, *P, *D;  /* (k, b) the same with the fingers' load; (k, k) (1 + G D)^-1; (k) */
+    value *G;                /* (k, k) displacement at the fingers per force at a finger, without the fingers' load */
     value *through;          /* (b, k) Y at^T */
-    value *held, *forced;    /* (k, b) -D resting, (k, k) -w² P^T: of G, what fingers add to fields */
-    value *row;              /* room for (b + k + r) */
+    value *held, *forced;    /* (k, b) -D resting; (k, k) -w² P^T: factors on G in the fields that the fingers add */
+    value *row;              /* work space (b + k + r) */
     lanes minus_omega2;
 } touched;
 
@@ -34,7 +35,8 @@ INLINE size_t touched_space(const plates *on) {
     return b * r + r + b * b + 4 * k * b + 3 * k * k + k + b + k + r;
 }
 
-/* P = (1 + G D)^-1 of G, one finger after the other: none gives energy, the plate is damped. */
+/* Replace P = G by (1 + G D)^-1. Elimination without pivoting is stable, because fingers and plate only dissipate
+ * energy. */
 INLINE void invert(value *restrict P, const value *D, size_t k) {
     for (size_t i = 0; i < k; i++) {
         for (size_t j = 0; j < k; j++) P[i * k + j] = times(P[i * k + j], D[j]);
@@ -57,7 +59,7 @@ INLINE void add(value *to, const value *more, size_t count) {
     for (size_t i = 0; i < count; i++) to[i] = (value){.re = to[i].re + more[i].re, .im = to[i].im + more[i].im};
 }
 
-/* Add to G (p, k) what attachments add, of X (p, b), accelerations at points by a force at each. */
+/* Add the effect of the attachments to G (p, k). X (p, b): accelerations at points per force at an attachment. */
 INLINE void by_eras(value *restrict G, size_t p, const value *X, const touched *of, const plates *on) {
     for (size_t i = 0; i < p; i++) {
         row_product(of->row, X + i * on->b, 1, of->through, on->b, on->k, 0, 0);
@@ -65,8 +67,8 @@ INLINE void by_eras(value *restrict G, size_t p, const value *X, const touched *
     }
 }
 
-/* G (p, k): displacement at points (p, r) by a force at each finger, without the others; of X (p, b),
- * accelerations there by a force at each attachment, or without these. */
+/* Compute G (p, k): displacement at points (p, r) per force at a finger, without the fingers' load. X (p, b):
+ * accelerations there per force at an attachment; NULL leaves the attachments out. */
 INLINE void by_fingers(value *restrict G, const float *points, size_t p, const value *X, const touched *of,
                        const plates *on) {
     const size_t k = on->k, r = on->r;
@@ -78,10 +80,11 @@ INLINE void by_fingers(value *restrict G, const float *points, size_t p, const v
     if (X) by_eras(G, p, X, of, on);
 }
 
-/* Frequency at a place of a block; beyond the last one it is repeated. */
+/* Return the row of a lane in a block; lanes beyond the last row repeat it. */
 INLINE int row_of_block(const plates *on, int first, int l) { return first + l < on->rows ? first + l : on->rows - 1; }
 
-/* T of cases of a block, whose frequencies follow each other, at one of the first thicknesses; NULL of others. */
+/* Return T of cases that form a stored block (consecutive frequencies at one of the first thicknesses), otherwise
+ * NULL. */
 INLINE const value *of_block(const plates *on, const int *rows, const int *cases) {
     const int thickness = cases[0] - rows[0] * on->t;
     int is_block = on->lanes == LANES && rows[0] % LANES == 0 && thickness < on->kept;
@@ -92,7 +95,7 @@ INLINE const value *of_block(const plates *on, const int *rows, const int *cases
     return is_block ? on->of_blocks + (size_t)(rows[0] / LANES * on->kept + thickness) * on->b * on->r : NULL;
 }
 
-/* Places in work space; the end of it. */
+/* Assign the arrays to places in the work space; return its end. */
 INLINE value *place(touched *to, const plates *on, value *work) {
     const size_t b = on->b, k = on->k, r = on->r;
     to->g = work + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
@@ -102,7 +105,7 @@ INLINE value *place(touched *to, const plates *on, value *work) {
     return to->row + b + k + r;
 }
 
-/* All that follows from what attachments do at the fingers, and from G of the free plate. */
+/* Compute all arrays that follow from `at` and from G of the plate without attachments. */
 SHARED void couple(touched *to, const plates *on, const int *rows, const int *cases) {
     const size_t b = on->b, k = on->k;
     load(to->Y, on->coupling, b * b, cases);
@@ -122,7 +125,7 @@ SHARED void couple(touched *to, const plates *on, const int *rows, const int *ca
     }
 }
 
-/* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
+/* Put the fingers on the plate for frequencies (LANES) and cases (LANES); return the end of the work space. */
 SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
     value *end = place(to, on, work);
     to->T = of_block(on, rows, cases);
@@ -134,12 +137,12 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
     return end;
 }
 
-/* found (p, width): accelerations at points (p, r), each of them of a finger, by a force at each of the first width
- * attachments and fingers; room for (p, b + k). */
+/* Compute found (p, width): accelerations at points (p, r) per force at each of the first `width` attachments and
+ * fingers. each: number of points per finger; room: work space (p, b + k). */
 SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, size_t each, const touched *of,
                       const plates *on, value *room) {
     const size_t b = on->b, k = on->k;
-    const value *X = of->at, *G = of->G; /* at the centres */
+    const value *X = of->at, *G = of->G; /* at the fingers' centres */
     if (points != on->centres || p != k) {
         value *of_eras = room, *of_fingers = room + p * b;
         const size_t r = on->r;
@@ -147,7 +150,7 @@ SHARED void to_points(value *restrict found, size_t width, const float *points, 
             size_t finger = 0;
             next = first + each;
             while (finger < k && memcmp(points + first * r, on->centres + finger * r, r * sizeof(float))) finger++;
-            if (finger < k) { /* what is known of its centre is not computed again */
+            if (finger < k) { /* the first point is the finger's centre, which is computed already */
                 memcpy(of_eras + first * b, of->at + finger * b, b * sizeof(value));
                 memcpy(of_fingers + first * k, of->G + finger * k, k * sizeof(value));
                 first++;
@@ -165,8 +168,8 @@ SHARED void to_points(value *restrict found, size_t width, const float *points, 
     }
 }
 
-/* moved (b + k, n): displacement of attachments and fingers by each ERA at full stroke, of that
- * without fingers (b, n). */
+/* Compute moved (b + k, n): displacement of attachments and fingers per ERA at full stroke. without (b, n): the same
+ * without fingers. */
 INLINE void with_fingers_moved(value *moved, const value *without, const touched *of, const value *drives,
                                const plates *on) {
     const size_t n = on->n, b = on->b, k = on->k;

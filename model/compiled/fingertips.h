@@ -1,14 +1,14 @@
-/* Shapes of the plate under fingertips: `model.table.table` and `model.finger` in C. */
+/* Shapes of the plate under fingertips. Reference: `model.table.table` and `model.finger`. */
 #ifndef FINGERTIPS_H
 #define FINGERTIPS_H
 
 #include "arena.h"
 
 typedef struct {
-    int nx, ny, side_x, side_y, r; /* points of the raster, and of a patch of it; reduced coordinates */
-    int few, fine;                 /* points of both rules */
-    double length, width, radius;  /* of the plate and of a fingertip [m] */
-    const float *points, *weights; /* (few + fine, 2) of the unit disc, the few first; (2, few + fine) */
+    int nx, ny, side_x, side_y, r; /* points of the raster; points of an interpolated patch; reduced coordinates */
+    int few, fine;                 /* points per fingertip: coarse and fine rule */
+    double length, width, radius;  /* size of the plate, radius of a fingertip [m] */
+    const float *points, *weights; /* (few + fine, 2) in the unit disc, coarse rule first; (2, few + fine) */
     const float *nodes;            /* (8, 2) Gauss-Legendre points and weights */
     const float *shapes;           /* (ny nx, r) */
 } raster;
@@ -19,7 +19,7 @@ typedef struct {
 
 INLINE double within(double a, double low, double high) { return a < low ? low : a > high ? high : a; }
 
-/* Centroid of the unit disc's part between two corners, which hold its centre. */
+/* Compute the centroid of the part of the unit disc inside a rectangle that contains its centre. */
 SHARED void centroid_of(double *to, const double *low, const double *high, const raster *on) {
     const double bottom = fmax(low[1], -1), top = fmin(high[1], 1);
     const double first = asin(fmax(low[0], -1)), last = asin(fmin(high[0], 1));
@@ -43,7 +43,8 @@ SHARED void centroid_of(double *to, const double *low, const double *high, const
     to[0] /= area, to[1] /= area;
 }
 
-/* Weights (points) of those kept, times the linear function that makes linear means exact; none is negative. */
+/* Refit the weights (points) of the kept points: multiply them by a linear function so that means of linear functions
+ * are exact, and raise negative weights to 0. */
 SHARED void refit(double *weights, const char *is_kept, const double *centroid, const raster *on) {
     const int count = on->few + on->fine;
     double sum = 0, A[3][4] = {{1e-9, 0, 0, 1}, {0, 1e-9, 0, centroid[0]}, {0, 0, 1e-9, centroid[1]}};
@@ -54,7 +55,7 @@ SHARED void refit(double *weights, const char *is_kept, const double *centroid, 
         for (int u = 0; u < 3; u++)
             for (int v = 0; v < 3; v++) A[u][v] += weights[i] * each[u] * each[v];
     }
-    for (int s = 0; s < 3; s++) /* definite */
+    for (int s = 0; s < 3; s++) /* positive definite, so no pivoting */
         for (int u = 0; u < 3; u++)
             for (int v = 3; u != s && v >= s; v--) A[u][v] -= A[u][s] / A[s][s] * A[s][v];
     sum = 0;
@@ -66,7 +67,7 @@ SHARED void refit(double *weights, const char *is_kept, const double *centroid, 
     for (int i = 0; i < count; i++) weights[i] /= sum;
 }
 
-/* Lagrange polynomials of the points 0, 1, ... (count) at x. */
+/* Compute the Lagrange polynomials of the nodes 0, 1, ..., count - 1 at x. */
 INLINE void lagrange(float *to, double x, int count) {
     for (int i = 0; i < count; i++) {
         double found = 1;
@@ -76,7 +77,8 @@ INLINE void lagrange(float *to, double x, int count) {
     }
 }
 
-/* Shapes under fingertips centred at places (k, 2) [m], and weights of the points in the mean over each. */
+/* Return the shapes under fingertips centred at places (k, 2) [m], and the weights of their points in the mean over a
+ * fingertip. */
 SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *memory) {
     const size_t r = on->r, few = on->few, fine = on->fine, count = few + fine, patch = on->side_x * on->side_y;
     const size_t half = patch / 2, padded = (r + LANES - 1) / LANES * LANES;
@@ -124,7 +126,8 @@ SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *m
                 for (int x = 0; x < side[0]; x++) share[y * side[0] + x] = along_y[y] * along_x[x];
             for (size_t at = 0; at < padded; at += LANES) {
                 lanes first = {0}, second = {0}, from;
-                for (size_t j = 0; j < patch - half; j++) { /* not even and odd: of other signs, these would cancel */
+                for (size_t j = 0; j < patch - half; j++) { /* halves instead of even and odd points, which have
+                                                             * opposite signs and would cancel */
                     memcpy(&from, near + (half + j) * padded + at, sizeof from);
                     second += share[half + j] * from;
                     if (j == half) break;

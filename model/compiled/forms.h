@@ -1,4 +1,4 @@
-/* Expected powers at groups of points: `model.ensemble.touched_plate.TouchedPlate.forms` in C. */
+/* Expected powers at groups of points. Reference: `model.ensemble.touched_plate.TouchedPlate.forms`. */
 #ifndef FORMS_H
 #define FORMS_H
 
@@ -6,17 +6,18 @@
 #include "fingers.h"
 
 typedef struct {
-    int groups, p, fine;       /* groups of points; points of each; fine points, of all */
-    int others;                /* whether plates of other thickness count */
+    int groups, p, fine;       /* groups of points; points per group; fine points of all groups */
+    int others;                /* whether the plate's thickness is uncertain */
     float gain_variance, ridge;
     const float *points, *fine_points, *weights; /* (groups p, r); (fine, r); (groups p) */
     const float *error;        /* (f, n) */
-    const float *shares;       /* (f, n, n) by which the power of h grows; NULL for none */
-    const char *is_fine;       /* (k) fingers whose fine points count; NULL for all */
-    int rim;                   /* first of a finger's fine points beside its first that count */
+    const float *shares;       /* (f, n, n) relative increase of the power of h by clock errors; NULL without errors */
+    const char *is_fine;       /* (k) whether fine points of a finger are needed; NULL for all fingers */
+    int rim;                   /* first of a finger's fine points that are needed, apart from its point 0 */
 } grouped;
 
-/* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is nominal. */
+/* Results at LANES frequencies: fields h (groups p, n) and at fine points (fine, n); forms R (groups, n, n), and R
+ * without the nominal part. */
 typedef struct {
     value *fields, *fine, *power, *uncertain;
 } formed;
@@ -27,16 +28,16 @@ SHARED formed new_forms(const plates *on, const grouped *of, arena *memory) {
                     .power = values(memory, groups * n * n), .uncertain = values(memory, groups * n * n)};
 }
 
-/* Times the force of each ERA, of accelerations (p, n) by forces. */
+/* Multiply accelerations per force (p, n) by the force of each ERA. */
 INLINE void drive(value *h, const value *drives, size_t p, size_t n) {
     for (size_t i = 0; i < p; i++)
         for (size_t e = 0; e < n; e++) h[i * n + e] = times(h[i * n + e], drives[e]);
 }
 
-/* At frequencies (LANES). */
+/* Compute fields and forms at rows (LANES). */
 SHARED void find_forms(formed *to, const plates *on, const grouped *of, const int *rows, arena *memory) {
     const size_t n = on->n, b = on->b, k = on->k, a = b + k, off = on->off, j = off + k;
-    const size_t p = of->p, groups = of->groups, at = groups * p, each = at % k ? at : at / k; /* of a finger */
+    const size_t p = of->p, groups = of->groups, at = groups * p, each = at % k ? at : at / k; /* points per finger */
     const int parts = of->others ? 4 : 2;
     const arena mark = *memory;
     int cases[LANES];
@@ -60,14 +61,14 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     load_real(error, of->error, n, rows);
     if (of->shares) load_real(shares, of->shares, n * n, rows);
 
-    /* By a force at each attachment; h by each ERA; and how it changes with all dampers. */
+    /* Fields t per force at an attachment, fields h per ERA, and their change with the damping. */
     to_points(t, a, of->points, at, each, &now, on, room);
     for (size_t i = 0; i < at; i++)
         for (size_t e = 0; e < n; e++) h[i * n + e] = times(t[i * a + e], drives[e]);
     const size_t fingers = of->fine % k ? 1 : k, fine_each = of->fine / fingers;
     for (size_t finger = 0; of->fine && finger < fingers; finger++) {
         if (of->is_fine && !of->is_fine[finger]) continue;
-        for (size_t part = 0; part < 2; part++) { /* the first alone where not all count */
+        for (size_t part = 0; part < 2; part++) { /* point 0, then the points from `rim` on */
             const size_t first = finger * fine_each + (part ? of->rim : 0);
             const size_t count = part ? fine_each - of->rim : of->rim > 0;
             value *found = fine + first * n;
@@ -91,7 +92,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
                 scaled(times(now.D[i], moved[(b + i) * n + e]), filled(on->load_std[i]));
     product(h + at * n, t, a, damped, at, n, n);
 
-    /* Plates thicker and thinner, each counting half, at points that count. */
+    /* Change of the fields on a thicker and on a thinner plate, with half the weight each. */
     for (int part = 2; part < parts; part++) {
         for (int l = 0; l < LANES; l++) cases[l] = rows[l] * on->t + part - 1;
         put_fingers(&now, on, rows, cases, space);
@@ -109,7 +110,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
         }
     }
 
-    /* Forms of the mean over each group, of the rows at its points and of what is uncertain. */
+    /* Form of each group: nominal fields at its points, plus all uncertain contributions. */
     for (size_t group = 0; group < groups; group++) {
         value *form = R + group * n * n, *to = X;
         size_t counted = 0;
@@ -134,7 +135,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
                 form[u * n + v].re += modelled[u * n + v].re;
                 form[u * n + v].im += modelled[u * n + v].im;
             }
-        for (size_t u = 0; of->shares && u < n; u++) /* clocks of amplifiers */
+        for (size_t u = 0; of->shares && u < n; u++) /* clock errors of amplifiers */
             for (size_t v = u; v < n; v++) {
                 form[u * n + v].re += shares[u * n + v] * modelled[u * n + v].re;
                 form[u * n + v].im += shares[u * n + v] * modelled[u * n + v].im;

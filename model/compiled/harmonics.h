@@ -1,11 +1,11 @@
-/* Second harmonics of tones on drawn plates: `TouchedPlate.harmonics` in C. */
+/* Second harmonics of tones on drawn plates. Reference: `TouchedPlate.harmonics`. */
 #ifndef HARMONICS_H
 #define HARMONICS_H
 
 #include "drawn.h"
 
-/* Plates at twice the frequencies, whose first thicknesses are those of the others; at few points of each finger
- * (k, few, r) of weights (k, few). No plates where ERAs have no harmonics. */
+/* The plate at twice the frequencies (NULL if ERAs have no harmonics), and the coarse points of each finger (k, few,
+ * r) with their weights (k, few). Its first thicknesses are those of the plate at the table's frequencies. */
 typedef struct {
     const plates *on;
     const float *threshold; /* (f) at twice the frequencies */
@@ -13,7 +13,7 @@ typedef struct {
     size_t few;
 } distortion;
 
-/* fields (m, bases, b + k, 2, padded): by each ERA at tones' weights (m, n), at full harmonics. */
+/* Return fields (m, bases, b + k, 2, padded) per ERA at the tones' weights (m, n), for harmonics as large as the tone. */
 SHARED float *harmonic_fields(const distortion *at, const draws *by, size_t m, const int *rows, const float *weights,
                               size_t padded, arena *memory) {
     const plates *on = at->on;
@@ -50,7 +50,8 @@ SHARED float *harmonic_fields(const distortion *at, const draws *by, size_t m, c
     return fields;
 }
 
-/* found (m, k, groups): squared amplitudes to threshold, mean over each fingertip; none of the nominal plate. */
+/* Return (m, k, groups): mean squared amplitudes over the fingertips relative to the threshold; 0 on the nominal
+ * plate. */
 SHARED lanes *find_harmonics(const distortion *at, const draws *by, size_t k, size_t m, const int *rows,
                              const float *weights, arena *memory) {
     const size_t groups = group_count(by);

@@ -1,28 +1,28 @@
 /* Knots of an onset and of an ending: least squares over hats at the fingers, within full stroke.
  *
- * What each form is, and why, is in model/transients/knots.py, which computes the same in numpy. Here
- * unknowns are ordered by combination, then by knot: knots lie on lanes, and a hat of the knot before
- * is one value further.
+ * The reference in numpy, model/transients/knots.py, explains the forms. Here, unknowns are ordered by
+ * combination, then by knot: lanes are knots, and the hat of the previous knot is shifted by one value.
  */
 #include "combinations.h"
 
 typedef struct {
     int samples, steps, knots, ending_knots, iterations;
-    float ridge, penalty, relaxation; /* relative to the mean of a form's diagonal, but the last */
+    float ridge, penalty, relaxation; /* ridge and penalty: relative to the mean of a form's diagonal */
     const float *rise;                /* (steps, samples) */
 } shaping;
 
 typedef struct {
     int eras, targets, rows, combinations;
-    float gain_variance, weight;       /* of the targets, or of an ending's quiet fingers: 0 without any */
+    float gain_variance, weight;       /* weight of the targets, or of the quiet fingers of an ending; 0 without such
+                                        * fingers */
     const float *hats;                 /* (samples, rows, steps, eras), complex */
     const double *steady, *amplitudes; /* (rows, eras), (eras), complex */
-    int total;                         /* of an ending: all ERAs, */
-    const int *active;                 /* (eras): those that play, */
-    const float *residual;             /* (ending knots, total) squared, complex: the plate's form */
+    int total;                         /* endings: number of all ERAs */
+    const int *active;                 /* endings: (eras) numbers of the ERAs that play */
+    const float *residual;             /* endings: form of the plate (ending knots, total) squared, complex */
 } shaped_tone;
 
-/* Expected sum of squares over so many rows of all ERAs together, under their errors. */
+/* Return the expected power of all ERAs together, summed over `rows` rows, with gain errors. */
 static double expected_power(const shaped_tone *of, size_t first, size_t rows) {
     double found = 0;
     for (size_t row = first; row < first + rows; row++) {
@@ -37,7 +37,7 @@ static double expected_power(const shaped_tone *of, size_t first, size_t rows) {
     return found;
 }
 
-/* Of rows from the first on the hats of the last knots, (samples, rows, eras, span): knots on lanes, then zeros. */
+/* Return the hats of the last knots for rows from `first` on, (samples, rows, eras, span): knots, padded with zeros. */
 static matrix hats_of(const shaped_tone *of, const shaping *by, size_t first, size_t knots, size_t span, arena *memory) {
     const size_t n = of->eras, rows = of->rows - first;
     const matrix found = zeros(by->samples * rows, apart(n * span), memory);
@@ -51,8 +51,8 @@ static matrix hats_of(const shaped_tone *of, const shaping *by, size_t first, si
     return found;
 }
 
-/* Form (count span) squared of rows of hats summed over all steps, errors included: blocks of two combinations of which
- * the first is not behind the second. */
+/* Return the form (count span) squared of hats, summed over all steps, with gain errors. Only the upper blocks of
+ * pairs of combinations are computed. */
 static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots, size_t span, float gain_variance,
                      arena *memory) {
     const size_t width = count * span;
@@ -61,7 +61,7 @@ static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots
         for (size_t j = i / span * span; j < width && i % span < knots; j += LANES) add_gram(&form, hats, rows, i, j, 1);
     for (size_t a = 0; a < count; a++)
         for (size_t k = knots - 1; k-- > 0;)
-            for (size_t b = a; b < count; b++) { /* what it was a step earlier */
+            for (size_t b = a; b < count; b++) { /* add the form of the previous step */
                 const size_t to = (a * span + k) * form.width + b * span, from = to + form.width + 1;
                 for (size_t l = 0; l < span; l += LANES) {
                     const value x = at(&form, to + l), y = at(&form, from + l);
@@ -77,7 +77,7 @@ static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots
     return form;
 }
 
-/* Add sign times the form's rows of the first knots times knots `first` to `end` of a constant (count). */
+/* Add sign times the form, in rows of the first knots, times a constant (count) at knots `first` to `end`. */
 static void add_held(const matrix *to, const matrix *form, const matrix *held, float sign, size_t count, size_t span,
                      size_t knots, size_t first, size_t end) {
     for (size_t a = 0; a < count; a++)
@@ -91,7 +91,7 @@ static void add_held(const matrix *to, const matrix *form, const matrix *held, f
                 to->re[a * span + k] += found_re * re - found_im * im;
                 to->im[a * span + k] += found_re * im + found_im * re;
             }
-            for (size_t l = first; l < end && b > a; l++) /* of a Hermitian form: its other block */
+            for (size_t l = first; l < end && b > a; l++) /* the lower block of the Hermitian form */
                 for (size_t k = 0; k < knots; k += LANES) {
                     const value from = conjugate(at(form, (a * span + l) * form->width + b * span + k));
                     put(to, b * span + k, add_product(at(to, b * span + k), from, by));
@@ -99,8 +99,8 @@ static void add_held(const matrix *to, const matrix *form, const matrix *held, f
         }
 }
 
-/* The first knots of each combination of a form, with more on its diagonal, and of a right side as A (n, n), its upper
- * triangle, and x (n); unknowns beyond are of no account. */
+/* Copy the first knots of each combination to A (n, n), upper triangle, with `more` added to its diagonal, and the
+ * right side to x (n). Padded unknowns have no effect. */
 static void pack(const matrix *A, const matrix *x, const matrix *form, const matrix *right, size_t count, size_t knots,
                  size_t span, float more) {
     for (size_t a = 0; a < count; a++) {
@@ -118,10 +118,11 @@ static void pack(const matrix *A, const matrix *x, const matrix *form, const mat
     }
 }
 
-/* Reduced to magnitudes of 1 at most. */
+/* Limit magnitudes to 1. */
 INLINE value within(value knots) { return scaled(knots, inverse(larger(root(power(knots)), filled(1)))); }
 
-/* Minimise x^H form x - 2 Re right^H x where no ERA exceeds its stroke: its first knots, (knots, eras) in found. */
+/* Minimise x^H form x - 2 Re right^H x such that no ERA exceeds its stroke, by the alternating direction method of
+ * multipliers; found (knots, eras): the first knots. */
 static void bounded_minimum(double *found, const matrix *form, const matrix *right, const matrix *combinations, size_t eras,
                             size_t count, size_t knots, size_t span, const shaping *by, arena *memory) {
     const size_t n = whole(count * knots), each = whole(knots), width = combinations->width;
@@ -165,7 +166,7 @@ static void bounded_minimum(double *found, const matrix *form, const matrix *rig
     for (size_t i = 0; i < knots * eras; i++) {
         const size_t from = i % eras * each + i / eras;
         const double re = feasible.re[from], im = feasible.im[from], magnitude = sqrt(re * re + im * im);
-        const double gain = (1 - 1e-12) / (magnitude > 1 ? magnitude : 1); /* whatever rounding does */
+        const double gain = (1 - 1e-12) / (magnitude > 1 ? magnitude : 1); /* within the stroke in spite of rounding */
         found[2 * i] = isfinite(magnitude) ? gain * re : 0, found[2 * i + 1] = isfinite(magnitude) ? gain * im : 0;
     }
 }
@@ -206,7 +207,7 @@ static void shape_onset(double *found, const shaped_tone *of, const shaping *by,
                     put(&line, k, add_product(at(&line, k), from, wanted));
                 }
             }
-            for (size_t step = 0; step < steps; step++) /* when a hat of knot k is as that of a later one at last */
+            for (size_t step = 0; step < steps; step++) /* a hat of knot k equals the last step of a later knot's hat */
                 for (size_t k = 0; k < free; k += LANES) {
                     const value from = at(&line, k + steps - 1 - step), old = at(&right, a * span + k);
                     const float rise = by->rise[step * by->samples + sample];
@@ -249,7 +250,7 @@ static void shape_ending(double *found, const shaped_tone *of, const shaping *by
                 const float own_im = start.re[e] * (float)steady[2 * e + 1] + start.im[e] * (float)steady[2 * e];
                 const float x = re + of->gain_variance * own_re, y = im + of->gain_variance * own_im;
                 float along_re = 0, along_im = 0;
-                for (size_t k = knots; k-- > 0;) { /* of this hat and all that follow */
+                for (size_t k = knots; k-- > 0;) { /* this hat and all later ones */
                     for (size_t sample = 0; sample < (size_t)by->samples; sample++) {
                         const size_t hat = (sample * rows + row) * hats.width + e * span + k;
                         along_re += hats.re[hat] * x + hats.im[hat] * y, along_im += hats.re[hat] * y - hats.im[hat] * x;
@@ -287,7 +288,7 @@ static int guarded(void (*shape)(double *, const shaped_tone *, const shaping *,
     return 0;
 }
 
-/* Knots but the last, (knots - 1, eras) complex, of an onset, or of an ending: 0, or NO_MEMORY. */
+/* Compute the knots of an onset or of an ending except the last, (knots - 1, eras) complex; return 0 or NO_MEMORY. */
 int shaped_knots(double *found, const shaped_tone *of, const shaping *by, int is_ending) {
     arena memory = {.last = NULL};
     const int status = guarded(is_ending ? shape_ending : shape_onset, found, of, by, &memory);

@@ -1,9 +1,9 @@
-/* Arithmetic of LANES frequencies, or of other cases, at once: as many as fill a register, by the
- * compiler's flags.
+/* Vector arithmetic on LANES cases, for example frequencies. The build sets LANES to the width of the
+ * processor's registers.
  *
- * A complex value is the real parts at all lanes and then the imaginary parts, and a matrix is one of
- * such values. Vector types are those of GCC and Clang, on any processor. Arrays of numpy hold one
- * case after the other; they are loaded into lanes and stored from them.
+ * A complex value consists of the real parts of all lanes, then the imaginary parts. A matrix is an array
+ * of such values. The vector types are those of GCC and Clang, for any processor. Arrays of numpy contain
+ * one case after another; `load` and `store` convert them.
  */
 #ifndef LANES_H
 #define LANES_H
@@ -14,7 +14,7 @@
 
 #define INLINE static inline __attribute__((always_inline))
 
-/* Called, not inlined at every place. */
+/* A function that is called instead of inlined. */
 #define SHARED static __attribute__((unused, noinline))
 
 typedef float lanes __attribute__((vector_size(LANES * sizeof(float))));
@@ -54,7 +54,7 @@ INLINE value reciprocal(value a) {
 
 INLINE lanes filled(float a) { return a - (lanes){0}; }
 
-INLINE lanes chosen(mask where, lanes a, lanes b) { /* a there, else b */
+INLINE lanes chosen(mask where, lanes a, lanes b) { /* a where the mask is set, otherwise b */
     return (lanes)((where & (mask)a) | (~where & (mask)b));
 }
 
@@ -68,7 +68,7 @@ INLINE lanes smaller(lanes a, lanes b) {
     return a;
 }
 
-INLINE lanes root(lanes a) { /* 0 for what rounding made negative */
+INLINE lanes root(lanes a) { /* 0 for values that rounding made negative */
     lanes found;
     for (int l = 0; l < LANES; l++) found[l] = sqrtf(a[l] > 0 ? a[l] : 0);
     return found;
@@ -92,7 +92,7 @@ static const value ZERO;
 #define mixed(a, b, ...) __builtin_shuffle(a, b, (mask){__VA_ARGS__})
 #endif
 
-/* Exchange rows and columns: each step deals all values out like cards of two halves. */
+/* Transpose a matrix of LANES rows: each step interleaves the upper and the lower half of the rows. */
 INLINE void transpose(lanes *rows) {
 #pragma GCC unroll 4
     for (int step = 1; step < LANES; step *= 2) {
@@ -151,14 +151,15 @@ INLINE void store_real(float *to, const lanes *restrict from, size_t width, size
         for (size_t i = 0; i < width; i++) to[width * l + i] = ((const float *)from)[LANES * i + l];
 }
 
-/* found (rows), each step apart, = a (rows, r), real, times b (r). */
+/* found (rows) = a (rows, r) b (r) with real a. step: distance between results. */
 SHARED void multiply_into(value *restrict found, size_t step, const float *restrict a,
                           const value *restrict b, size_t rows, size_t r) {
     size_t row = 0;
     for (; row < rows && rows >= 4; row += 4) {
-        if (row + 4 > rows) row = rows - 4; /* some once more: one alone takes as long as four */
+        if (row + 4 > rows) row = rows - 4; /* the last four rows again: one row takes as long as four */
         const float *a0 = a + row * r, *a1 = a0 + r, *a2 = a1 + r, *a3 = a2 + r;
-        value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* in registers, as no array is */
+        value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* single variables, because the compiler keeps no array in
+                                                           * registers */
         for (size_t j = 0; j < r; j++) {
             value from = b[j];
             s0.re += a0[j] * from.re, s0.im += a0[j] * from.im;
@@ -179,11 +180,11 @@ SHARED void multiply_into(value *restrict found, size_t step, const float *restr
     }
 }
 
-/* found (columns) = b (columns, r) times a (r), real. */
+/* found (columns) = b (columns, r) a (r) with real a. */
 SHARED void multiply_row(value *restrict found, const float *restrict a, const value *restrict b, size_t r, size_t columns) {
     size_t column = 0;
     for (; column < columns && columns >= 4; column += 4) {
-        if (column + 4 > columns) column = columns - 4; /* as above */
+        if (column + 4 > columns) column = columns - 4; /* as in `multiply_into` */
         const value *b0 = b + column * r, *b1 = b0 + r, *b2 = b1 + r, *b3 = b2 + r;
         value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO;
         for (size_t j = 0; j < r; j++) {
@@ -197,21 +198,21 @@ SHARED void multiply_row(value *restrict found, const float *restrict a, const v
     for (; column < columns; column++) multiply_into(found + column, 1, a, b + column * r, 1, r);
 }
 
-/* found (rows, columns) = a (rows, r), real, times b (columns, r) transposed. */
+/* found (rows, columns) = a (rows, r) b^T with real a and b (columns, r). */
 INLINE void multiply(value *found, const float *a, const value *b, size_t rows, size_t r, size_t columns) {
     for (size_t row = 0; row < rows && rows < 4; row++) multiply_row(found + row * columns, a + row * r, b, r, columns);
     for (size_t column = 0; column < columns && rows >= 4; column++)
         multiply_into(found + column, columns, a, b + column * r, rows, r);
 }
 
-/* found (columns) from the first on, or a few before it, = a (inner) b (inner, columns), each step apart in a, or of a
- * conjugated. */
+/* found (columns) = a (inner) b (inner, columns), or conj(a) b, at least from column `first` on. step: distance
+ * between the values of a. */
 SHARED void row_product(value *restrict found, const value *a, size_t step, const value *b, size_t inner,
                         size_t columns, size_t first, int conjugated) {
     const float sign = conjugated ? -1 : 1;
     size_t j = first;
     for (; j < columns && columns >= 4; j += 4) {
-        if (j + 4 > columns) j = columns - 4; /* as above */
+        if (j + 4 > columns) j = columns - 4; /* as in `multiply_into` */
         value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO;
         for (size_t s = 0; s < inner; s++) {
             const value *from = b + s * columns + j;
@@ -233,20 +234,20 @@ SHARED void row_product(value *restrict found, const value *a, size_t step, cons
     }
 }
 
-/* found (rows, columns) = a (rows, inner) b (inner, columns), the rows of a each width long. */
+/* found (rows, columns) = a (rows, inner) b (inner, columns). width: distance between the rows of a. */
 SHARED void product(value *restrict found, const value *a, size_t width, const value *b, size_t rows,
                     size_t inner, size_t columns) {
     for (size_t i = 0; i < rows; i++)
         row_product(found + i * columns, a + i * width, 1, b, inner, columns, 0, 0);
 }
 
-/* The upper triangle of R (n, n) = X^H X of X (rows, n), and some below it. */
+/* R (n, n) = X^H X of X (rows, n); at least the upper triangle. */
 SHARED void gram(value *restrict R, const value *X, size_t rows, size_t n) {
     for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, 1);
 }
 
-/* Factors of a positive Hermitian R (n, n), of which the upper triangle is given, in its place; a pivot's inverse is the
- * imaginary part of its diagonal. */
+/* Factorise a positive definite Hermitian R (n, n) in place, from its upper triangle. The inverse of each pivot is
+ * stored as the imaginary part of the diagonal. */
 SHARED void factorise(value *restrict R, size_t n) {
     for (size_t s = 0; s < n; s++) {
         const value *from = R + s * n;
@@ -259,7 +260,7 @@ SHARED void factorise(value *restrict R, size_t n) {
     }
 }
 
-/* x = R^-1 x of R as `factorise` leaves it. */
+/* x = R^-1 x with R from `factorise`. */
 SHARED void solve_factorised(value *restrict x, const value *restrict R, size_t n) {
     for (size_t s = 0; s < n; s++)
         for (size_t u = s + 1; u < n; u++) {

@@ -1,4 +1,4 @@
-/* Accelerations at points that lie on lanes, of one case after the other: of a few cases at many points. */
+/* Accelerations at many points for few cases: lanes are points, and cases follow one another. */
 #ifndef POINTS_H
 #define POINTS_H
 
@@ -16,8 +16,8 @@ INLINE value add_scaled(value sum, value f, float re, float im) {
     return (value){.re = sum.re + re * f.re - im * f.im, .im = sum.im + re * f.im + im * f.re};
 }
 
-/* found (count, 2, padded), each so far apart: real and imaginary parts at points of coordinates (count, r); columns (r,
- * padded). */
+/* Compute found (count, 2, padded): real and imaginary parts at points, for reduced coordinates (count, r) and shapes
+ * `columns` (r, padded). each: distance between results of different coordinates. */
 SHARED void at_points(float *found, size_t each, const float *coordinates, size_t count, const float *columns, size_t padded,
                       size_t r) {
     for (size_t first = 0; first < count; first += 4)
@@ -43,7 +43,7 @@ SHARED void at_points(float *found, size_t each, const float *coordinates, size_
 
 INLINE size_t padded_to(size_t points) { return (points + LANES - 1) / LANES * LANES; }
 
-/* (r, padded) of rows (points, r) and then of the fingers' centres. */
+/* Return the shapes at points (points, r) and then at the fingers' centres as columns (r, padded). */
 SHARED float *columns_of(const float *rows, size_t points, const plates *on, arena *memory) {
     const size_t r = on->r, every = points + on->k, padded = padded_to(every);
     float *found = floats(memory, r * padded);
@@ -53,8 +53,9 @@ SHARED float *columns_of(const float *rows, size_t points, const plates *on, are
     return found;
 }
 
-/* Bring what is at points by attachments, and displacement by each finger, (b + k, 2, padded) without the fingers, to
- * that with them in its place; by through (b, k), held (k, b) and forced (k, k) of `touched`. */
+/* Add the effect of the fingers, in place, to accelerations at points per force at an attachment and displacements per
+ * force at a finger (b + k, 2, padded). through: arrays `through` (b, k), `held` (k, b) and `forced` (k, k) of
+ * `touched`. */
 SHARED void add_fingers(float *at, const float *through, const plates *on, size_t padded) {
     const size_t b = on->b, k = on->k;
     const float *held = through + 2 * b * k, *forced = held + 2 * k * b;
@@ -81,8 +82,9 @@ SHARED void add_fingers(float *at, const float *through, const plates *on, size_
     }
 }
 
-/* Put the fingers on plates of cases (count, up to LANES), as `put_fingers`, but for T and g; and found, (b + k, 2, padded),
- * each so far apart: accelerations at points by a force at each attachment and finger. columns: of so many points. */
+/* Put the fingers on the plate for cases (count, up to LANES) as in `put_fingers`, but without T and g. Also compute
+ * found (b + k, 2, padded) for each case: accelerations at points per force at an attachment or finger. each: distance
+ * between cases; columns: from `columns_of`. */
 SHARED void put_fingers_at_points(touched *to, float *found, size_t each, const plates *on, const int *rows, const int *cases,
                                   size_t count, const float *columns, size_t padded, size_t points, value *space,
                                   arena *memory) {

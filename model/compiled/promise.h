@@ -1,18 +1,18 @@
-/* What fingers feel of all contents together, on the nominal plate and on drawn ones. */
+/* Levels and contrasts at all fingers while all contents play, on the nominal plate and on drawn plates. */
 #ifndef PROMISE_H
 #define PROMISE_H
 
 #include "answer.h"
 
-/* Powers to threshold of contents: (contents, groups, points). */
+/* Powers of contents relative to the threshold (contents, groups, points), and their gains. */
 typedef struct {
     const plates *on;
     const rules *by;
     const question *of;
     const int *rows;
     const lanes *powers;
-    const lanes *harmonics; /* (contents, k, groups) over fingertips */
-    const float *gains, *harmonic_gains; /* of contents, and of their harmonics */
+    const lanes *harmonics; /* (contents, k, groups) mean over the fingertips */
+    const float *gains, *harmonic_gains; /* per content: gain of the tone, and of its second harmonic */
     size_t groups, plates;
 } felt;
 
@@ -23,7 +23,8 @@ INLINE lanes root_of(const felt *of, size_t content, size_t group, size_t point)
     return of->gains[content] * root(of->powers[(content * of->groups + group) * points + point]);
 }
 
-/* Mean amplitude of a content over a fingertip, less what others of its frequency may cancel. */
+/* Return the mean amplitude of a content over a fingertip, reduced by contents of the same frequency, which can cancel
+ * it. alone: ignore other contents. */
 SHARED lanes own_amplitude(const felt *of, size_t content, size_t group, size_t finger, int alone) {
     const size_t fine = of->of->fine;
     lanes mean = {0};
@@ -36,7 +37,7 @@ SHARED lanes own_amplitude(const felt *of, size_t content, size_t group, size_t 
     return mean;
 }
 
-/* Power of all contents but one at the loudest point of a finger; amplitudes of one frequency add. */
+/* Return the power of all contents except one at the loudest point of a finger; amplitudes of equal frequency add. */
 SHARED lanes foreign_power(const felt *of, size_t without, size_t group, size_t finger) {
     const size_t fine = of->of->fine, contents = of->of->contents, points = of->on->k * fine;
     lanes loudest = {0};
@@ -79,8 +80,8 @@ INLINE void keep(float *values, lanes found, const draws *by, size_t group) {
     memcpy(values + first, &found, count * sizeof(float));
 }
 
-/* Factors on the gains to the levels: of one priority the louder ones are lowered first, to one level (max-min), until
- * all fit into what is left of the stroke. */
+/* Lower the gains until all contents fit into the stroke; return the smallest factor. Higher priorities get the stroke
+ * first. Within a priority, the loudest contents are lowered to a common level (max-min fairness). */
 SHARED float share_stroke(float *gains, const question *of, const float *weights, size_t n, arena *memory) {
     const size_t contents = of->contents;
     const arena mark = *memory;
@@ -118,7 +119,7 @@ SHARED float share_stroke(float *gains, const question *of, const float *weights
                 for (size_t e = 0; e < n; e++)
                     full[e] += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
             }
-        for (size_t e = 0; e < n; e++) /* rounding leaves no stroke */
+        for (size_t e = 0; e < n; e++) /* rounding must not leave a rest of the stroke */
             left[e] = full[e] >= left[e] * (1 - NEARLY) ? 0 : left[e] - full[e];
     }
     release(memory, mark);
@@ -133,13 +134,14 @@ INLINE void to_decibels(float *ratios, size_t count) {
     for (size_t i = 0; i < count; i++) ratios[i] = 20 * log10f(ratios[i]);
 }
 
-/* Lower figures (3) to those of ratios: nominal, of half of the plates, promised. */
+/* Lower figures (3) to the nominal, the median and the promised value of ratios, if these are lower. */
 INLINE void lower(float *figures, float *ratios, const felt *of) {
     const float found[3] = {ratios[0], promised(ratios, of, 50), promised(ratios, of, of->by->promised)};
     for (int i = 0; i < 3; i++) figures[i] = fminf(figures[i], found[i]);
 }
 
-/* Levels by the first set of thresholds, contrasts lowered to those by one set, to which gains are, and foreign levels. */
+/* Compute foreign levels for a threshold set, and lower contrasts to the contrasts for this set; for the first set,
+ * also compute levels. The gains in `now` are relative to the set. */
 SHARED void compare(answered *to, const felt *now, int set, float *own, float *some, float *worst, arena *memory) {
     const question *of = now->of;
     const size_t contents = of->contents, plates = now->plates, groups = now->groups;
@@ -179,7 +181,8 @@ SHARED void compare(answered *to, const felt *now, int set, float *own, float *s
         lower(to->contrast + 3 * finger, some, now);
     }
     if (any) {
-        for (int t = 0; contents == 1 && t < of->starts[1]; t++) { /* an only content has that of the loudest finger */
+        for (int t = 0; contents == 1 && t < of->starts[1]; t++) { /* a single content has the contrast of the
+                                                                    * loudest quiet finger */
             memcpy(some, worst, plates * sizeof(float));
             lower(to->contrast + 3 * of->targets[t], some, now);
         }
@@ -188,7 +191,7 @@ SHARED void compare(answered *to, const felt *now, int set, float *own, float *s
     release(memory, mark);
 }
 
-/* Figures of tones at rows, of weights (contents, n). */
+/* Compute gains, levels and contrasts of the tones in `to`. */
 SHARED void promise(answered *to, const plates *on, const rules *by, const question *of, const float *columns,
                     arena *memory) {
     const size_t contents = of->contents, k = on->k, points = k * of->fine, groups = group_count(of->promise);

@@ -1,4 +1,4 @@
-/* Products and equations of complex matrices whose columns lie on lanes: of one case, where lanes.h has many. */
+/* Products and linear equations of complex matrices of a single case: lanes are columns (in lanes.h, lanes are cases). */
 #ifndef ROWS_H
 #define ROWS_H
 
@@ -6,7 +6,7 @@
 
 typedef float loose __attribute__((vector_size(LANES * sizeof(float)), aligned(4), may_alias));
 
-/* Rows of complex values, each width long; real and imaginary parts apart. */
+/* A matrix with `width` complex values per row; real and imaginary parts are separate arrays. */
 typedef struct {
     float *re, *im;
     size_t width;
@@ -14,11 +14,11 @@ typedef struct {
 
 INLINE size_t whole(size_t count) { return (count + LANES - 1) / LANES * LANES; }
 
-/* Width of rows such that a column does not crowd into a few sets of the processor's cache. */
+/* Return a row width for which a column does not map to a few sets of the processor's cache. */
 INLINE size_t apart(size_t width) { return width + LANES; }
 
 static matrix zeros(size_t rows, size_t width, arena *memory) {
-    const size_t size = rows * width + 4 * LANES; /* some are read and written beyond the last */
+    const size_t size = rows * width + 4 * LANES; /* whole registers are read and written beyond the last value */
     float *at = floats(memory, 2 * size);
     memset(at, 0, 2 * size * sizeof(float));
     return (matrix){.re = at, .im = at + size, .width = width};
@@ -42,9 +42,10 @@ INLINE float sum(lanes a) {
     return parts[0];
 }
 
-/* Add to C, at rows i to i + 3 and LANES columns from j on, sign times X^H X over so many rows of X. */
+/* Add sign times X^H X, over the first `rows` rows of X, to C at rows i to i + 3 and LANES columns from j on. */
 INLINE void add_gram(const matrix *C, const matrix *X, size_t rows, size_t i, size_t j, float sign) {
-    value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* in registers, as no array is */
+    value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* single variables, because the compiler keeps no array in
+                                                       * registers */
     for (size_t row = 0; row < rows; row++) {
         const float *re = X->re + row * X->width + i, *im = X->im + row * X->width + i;
         const value from = at(X, row * X->width + j);
@@ -61,8 +62,9 @@ INLINE void add_gram(const matrix *C, const matrix *X, size_t rows, size_t i, si
     }
 }
 
-/* R of R^H R = A (n, n), n whole registers, in the place of its upper triangle; its diagonal is inverted beside it, and
- * zero in its place. What is below the diagonal of A does not matter. No pivot is below a floor. */
+/* Replace the upper triangle of A (n, n) by R with R^H R = A (Cholesky); n is a multiple of LANES. The diagonal of R
+ * is set to zero, and its inverse stored in `inverted`. Entries below the diagonal are ignored. Pivots are at least
+ * `floor`. */
 static void factorize(const matrix *A, float *inverted, float floor) {
     const size_t n = A->width;
     for (size_t i = 0; i < n; i += 4) {
@@ -84,7 +86,7 @@ static void factorize(const matrix *A, float *inverted, float floor) {
     }
 }
 
-/* x = (R^H R)^-1 x. */
+/* x = (R^H R)^-1 x with R from `factorize`. */
 static void solve(const matrix *x, const matrix *R, const float *inverted) {
     const size_t n = R->width;
     for (size_t row = 0; row < n; row++) {
@@ -105,8 +107,8 @@ static void solve(const matrix *x, const matrix *R, const float *inverted) {
     }
 }
 
-/* to (rows, count), rows to_each apart, = a (rows, inner), with these steps between its rows and columns, or of it
- * conjugated (sign -1), times from (inner, count), rows each apart. Whole registers are read and written. */
+/* to (rows, count) = a (rows, inner) from (inner, count), or conj(a) from (sign -1). to_each, step, each: distances
+ * between the rows of `to`, `a` and `from`; next: between the columns of a. Whole registers are read and written. */
 static void combine(const matrix *to, size_t to_each, const matrix *a, size_t step, size_t next, float sign,
                     const matrix *from, size_t each, size_t rows, size_t inner, size_t count) {
     for (size_t i = 0; i < rows; i++)

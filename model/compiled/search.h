@@ -1,33 +1,36 @@
-/* Weights of all ERAs at one frequency for the targets of one content: `model.drive_modes` in C. */
+/* Search for the weights of all ERAs at one frequency for the targets of one content. Reference: `model.drive_modes`. */
 #ifndef SEARCH_H
 #define SEARCH_H
 
 #include "arena.h"
 
 typedef struct {
-    int steps, limited;   /* weights; whether each is brought to the level within full stroke */
-    float variance, gain; /* of each ERA beyond that of the form; up to full stroke, 0 for none */
+    int steps, limited;   /* number of weights tried; whether weights are limited to full stroke at the level */
+    float variance, gain; /* extra gain variance per ERA; gain up to full stroke, 0 for none */
     float reserve, growth, most;
 } method;
 
-/* How phases of several targets are aligned. */
+/* How the phases at several targets are aligned. */
 typedef struct {
-    int starts, iterations, again; /* targets whose own optimum gives a start; from each; from the step before */
+    int starts, iterations, again; /* number of starts; iterations from each start; iterations from the previous
+                                    * step's result */
 } phases;
 
-/* LANES frequencies; points: of each quiet form, which count one by one, 0 for none. */
+/* The problem at LANES frequencies. points: number of points per quiet finger that count individually; 0 if the mean
+ * counts. */
 typedef struct {
     size_t n, targets, quiet, points, few, fine;
     phases phases;
     float margin;
     lanes wanted;
     const value *target, *target_power; /* (targets, n), (targets, n, n) */
-    const value *const *forms;          /* (quiet) of (n, n) each, whose upper triangle counts */
-    const value *at_points;             /* (quiet points, n) fields beside the forms */
+    const value *const *forms;          /* (quiet) forms (n, n); only upper triangles are used */
+    const value *at_points;             /* (quiet points, n) fields, in addition to the forms */
     const value *few_fields, *fine_fields; /* (quiet few, n), (quiet fine, n) */
 } searched;
 
-/* The best weights (n) that reach the level and their score, the best score of those that miss it, and the bound. */
+/* The best weights (n) that reach the level, their score, the best score of weights that miss the level, and an upper
+ * bound. */
 typedef struct {
     value *weights;
     lanes score, missed, bound;
@@ -37,7 +40,7 @@ static const float LEAST = 1e-30f, TINY = 1e-7f, LEAST_FIELD = 1e-20f, STABLE = 
 
 INLINE size_t constraints(const searched *on) { return on->quiet * (on->points ? on->points : 1); }
 
-/* w^H R w of a Hermitian form. */
+/* w^H R w with Hermitian R. */
 INLINE lanes expected(const value *R, const value *w, size_t n) {
     lanes sum = {0};
     for (size_t i = 0; i < n; i++) {
@@ -48,14 +51,14 @@ INLINE lanes expected(const value *R, const value *w, size_t n) {
     return 2 * sum;
 }
 
-/* sum of a w. */
+/* Sum of a times w. */
 INLINE value field(const value *a, const value *w, size_t n) {
     value sum = ZERO;
     for (size_t i = 0; i < n; i++) sum = add_product(sum, a[i], w[i]);
     return sum;
 }
 
-/* Expected power at each quiet fingertip, or at each of its points. */
+/* Compute the expected power at each quiet fingertip or at each of its points. */
 SHARED void quiet_power(lanes *restrict found, const searched *on, const value *w) {
     size_t n = on->n;
     for (size_t q = 0; q < on->quiet; q++) {
@@ -74,7 +77,7 @@ SHARED void quiet_power(lanes *restrict found, const searched *on, const value *
     }
 }
 
-/* Amplitude at the weakest target, and what is left of it less the margin. */
+/* Return the amplitude at the weakest target; least: the same after subtracting the margin. */
 SHARED lanes amplitude(lanes *least, const searched *on, const value *w) {
     const size_t n = on->n;
     lanes found = filled(INFINITY);
@@ -93,7 +96,7 @@ INLINE lanes loudest_of(const lanes *power, size_t count) {
     return found;
 }
 
-/* R (n, n), upper triangle, of shares of the quiet fingertips. */
+/* Compute R (n, n), upper triangle: the forms of the quiet fingertips, weighted by shares. */
 INLINE void weighted(value *restrict R, const searched *on, const lanes *share) {
     const size_t n = on->n, points = on->points;
     memset(R, 0, n * n * sizeof(value));
@@ -114,7 +117,7 @@ INLINE void weighted(value *restrict R, const searched *on, const lanes *share) 
     }
 }
 
-/* w (n) = sum of columns (targets, n), each times a factor, scaled to a largest magnitude of 1. */
+/* w (n) = sum of columns (targets, n) times factors, scaled to a largest magnitude of 1. */
 SHARED void weigh(value *restrict w, const value *columns, const value *factor, size_t targets, size_t n) {
     lanes most = {0};
     for (size_t u = 0; u < n; u++) {
@@ -126,11 +129,12 @@ SHARED void weigh(value *restrict w, const value *columns, const value *factor, 
     for (size_t u = 0; u < n; u++) w[u] = scaled(w[u], most);
 }
 
-/* Raised by a gain up to full stroke. */
+/* Multiply by a gain, limited to full stroke. */
 INLINE value saturated(value w, float gain) { return scaled(w, inverse(larger(root(power(w)), filled(1 / gain)))); }
 
-/* Set phases of factors (targets) to those of what they reach, and raise that of a weaker target, step by step; the best,
- * by what the weakest target gets per root of the power. With a gain above 1 by the level of weights w (n) raised by it. */
+/* Improve factors (targets) step by step: give each the phase of the field at its target, and raise those of weaker
+ * targets. Keeps the best factors by the amplitude at the weakest target per root of the power, or, with a gain above
+ * 1, by the amplitude of weights w (n) at this gain. */
 SHARED void align(value *restrict best, lanes *highest, value *restrict factor, value *restrict w, float gain, int steps,
                   const value *gram, const value *columns, const searched *on) {
     const size_t targets = on->targets, n = on->n;
@@ -161,8 +165,9 @@ SHARED void align(value *restrict best, lanes *highest, value *restrict factor, 
     }
 }
 
-/* Weights w of largest magnitude 1 of the least power R, which is lost, and their bound: w = R^-1 sum of conj(target)
- * times a factor. best (targets): factors to start from, but for a first step, and as found; gain: as of `align`. */
+/* Compute the weights w = R^-1 sum of conj(target) times factor of least power, with a largest magnitude of 1; return
+ * their bound. Overwrites R. best (targets): the factors, on input those of the previous step unless this is the
+ * first; gain: see `align`. */
 SHARED lanes least_power(value *restrict w, value *restrict R, value *restrict best, int is_first, float gain,
                          const searched *on, arena *memory) {
     const size_t n = on->n, targets = on->targets, most_starts = on->phases.starts;
@@ -196,7 +201,7 @@ SHARED lanes least_power(value *restrict w, value *restrict R, value *restrict b
     return highest;
 }
 
-/* The best of as many weights as a method has steps. */
+/* Search for the best weights in the steps of a method. */
 SHARED void search(best *to, const searched *on, const method *by, arena *memory) {
     const size_t n = on->n, q = constraints(on);
     const arena mark = *memory;
@@ -259,7 +264,7 @@ SHARED void search(best *to, const searched *on, const method *by, arena *memory
     release(memory, mark);
 }
 
-/* Whether no weights reach the level where those that miss it are better than the best that reach it. */
+/* Return whether no weights reach the level, although weights that miss it score above the best elsewhere. */
 INLINE int is_limited(float score, float missed, float highest) { return score == 0 && missed > highest; }
 
 #endif

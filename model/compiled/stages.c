@@ -1,12 +1,12 @@
-/* Stages of an answer for arrays of numpy: fingertips, forms, and what is felt of tones. */
+/* Kernels for single stages of an answer, called by numpy code: fingertips, forms, and felt tones. */
 #include "answer.h"
 
 typedef struct {
-    float *fields, *fine, *power, *uncertain; /* as `formed`, by frequency */
+    float *fields, *fine, *power, *uncertain; /* see `formed`; one entry per frequency */
 } found_forms;
 
 typedef struct {
-    float *powers, *means, *loudest; /* (m, points, plates) or none; (m, k, plates) twice */
+    float *powers, *means, *loudest; /* (m, points, plates) or NULL; (m, k, plates); (m, k, plates) */
 } found_tones;
 
 typedef struct {
@@ -85,14 +85,14 @@ static int done(void (*run)(const job *, arena *), job each) {
     return status;
 }
 
-/* `tips` but for the centres, under fingertips at places (count, 2) [m]. */
+/* Compute `tips`, without the centres, for fingertips at places (count, 2) [m]. */
 int fingertips_stage(const raster *on, const double *places, int count, void *few, void *fine, void *few_weights,
                      void *fine_weights) {
     return done(run_fingertips, (job){.on = on, .by = places, .count = count,
                                       .to = {few, fine, few_weights, fine_weights}});
 }
 
-/* Keep what searches of all frequencies in their order read. */
+/* Store T in blocks of consecutive frequencies, for searches over all frequencies. */
 int blocks_stage(plates *on) {
     const size_t each = (size_t)on->b * on->r;
     value *to = on->of_blocks;
@@ -105,12 +105,12 @@ int blocks_stage(plates *on) {
     return FOUND;
 }
 
-/* Forms at rows (count). */
+/* Compute fields and forms at rows (count). */
 int forms_stage(const plates *on, const grouped *of, const int *rows, int count, found_forms *to) {
     return done(run_forms, (job){.on = on, .by = of, .rows = rows, .count = count, .to = {to}});
 }
 
-/* Tones at rows (count) of weights (count, n). */
+/* Compute the felt amplitudes of tones at rows (count) with weights (count, n). */
 int tones_stage(const plates *on, const draws *by, const sensors *at, const int *rows, int count, float *weights,
                 found_tones *to) {
     return done(run_tones, (job){.on = on, .by = by, .of = at, .rows = rows, .count = count, .to = {to, weights}});

@@ -51,5 +51,7 @@ class LibraryHook(BuildHookInterface):  # type: ignore[type-arg]
 def _platform() -> str:
     """Return the platform in a wheel's tag: C library and its version, or the oldest macOS."""
     if sys.platform == "linux":
-        return next(platform_tags())
+        for tag in platform_tags():
+            if not tag.startswith("linux_"):  # which no package index takes
+                return tag
     return sysconfig.get_platform().replace("-", "_").replace(".", "_")

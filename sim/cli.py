@@ -140,11 +140,16 @@ def sim(
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
         loaded_rig = load_rig(rig)
-        if firmware and (common_wire is not None or wire or line or faults or virtual_time):
-            raise InputError(
-                "--firmware has a serial line, real time and a plate that does not move; omit the "
-                "other options"
-            )
+        if firmware:
+            flags = {
+                "--wire": wire,
+                "--shared": shared,
+                "--speed": speed,
+                "--line": line,
+                "--faults": faults,
+                "--virtual-time": virtual_time,
+            }
+            _check_firmware_options(ports, flags)
         program = find_firmware() if firmware else None
         urls_to_wire = {} if firmware else loaded_rig.amplifiers
         wires = assign_wires(
@@ -183,6 +188,22 @@ def _common_wire(
         return None
     (kind,) = kinds
     return replace(defaults, kind=kind, port=ports[kind] or 0)
+
+
+def _check_firmware_options(
+    ports: Mapping[str, int | None], other_options: Mapping[str, object]
+) -> None:
+    """Raise InputError if options are given that `--firmware` does not support.
+
+    ports: by kind of wire, None for unset options; other_options: by name, false if unset.
+    """
+    unsupported = [f"--{kind}" for kind, port in ports.items() if port is not None]
+    unsupported += [name for name, value in other_options.items() if value]
+    if unsupported:
+        raise InputError(
+            f"--firmware must be used without {', '.join(unsupported)}: each amplifier has a "
+            "serial line of its own and runs in real time, and the plate does not move"
+        )
 
 
 def _fault_file(path: Path | None, rig: "Rig") -> "FaultFile":

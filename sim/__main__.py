@@ -10,18 +10,20 @@ def main() -> int:
         os.environ.setdefault(variable, "1")  # before numpy loads: more are slower
     from sim.early_exit import exit_on_signal
 
-    try:
-        with exit_on_signal():
-            import typer
+    with exit_on_signal():
+        import typer
 
-            from sim.cli import EXIT_STATUS, sim
+        from sim.cli import EXIT_STATUS, sim
 
-            app = typer.Typer(pretty_exceptions_enable=False)
-            app.command()(sim)
+        app = typer.Typer(pretty_exceptions_enable=False)
+        app.command()(sim)
+        try:
             app(prog_name="python -m sim")
-    except tuple(EXIT_STATUS) as error:
-        sys.stderr.write(f"sim: error: {error}\n")
-        return next(status for kind, status in EXIT_STATUS.items() if isinstance(error, kind))
+        except tuple(EXIT_STATUS) as error:
+            sys.stderr.write(f"sim: error: {error}\n")
+            for kind, status in EXIT_STATUS.items():
+                if isinstance(error, kind):
+                    return status
     return 0
 
 

@@ -141,6 +141,17 @@ async def test_simulation_exits_on_a_signal_while_it_starts(tmp_path: Path, afte
         assert err == b""
 
 
+async def test_sim_reports_a_package_that_is_missing() -> None:
+    """The error names the package, although the exit statuses are in a module that needs it."""
+    program = "import sys; sys.modules['typer'] = None; from sim.__main__ import main; main()"
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-P", "-c", program),
+        stderr=asyncio.subprocess.PIPE,
+    )
+    _, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
+    assert err.decode().splitlines()[-1].startswith("ModuleNotFoundError: import of typer")
+
+
 @pytest.fixture
 def socket_path() -> Iterator[Path]:
     """A path short enough for a Unix socket, wherever tests keep their files."""

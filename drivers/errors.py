@@ -85,6 +85,53 @@ class CommandError(DriverError, ValueError):
     """An invalid request: bad URL, unknown channel, value out of range."""
 
 
+_NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
+_REMEDIES = {
+    "WRONG_SESSION": "; another host has armed it, or armed it last: disarm, then arm again",
+    "WRONG_STATE": "; find the cause with `era amp status`, then clear and arm again",
+}
+
+
+def refused_by_amplifier(
+    where: str, code: str, channel: int | None, *, may_play: bool
+) -> CommandRefused:
+    """Return the error of a request that an amplifier refused by a Nak with this code and channel.
+
+    where: the line and the amplifier, as the message begins. may_play: see `CommandRefused`.
+    """
+    at_channel = "" if channel is None else f", channel {channel}"
+    return CommandRefused(
+        f"{where}: the amplifier refused the request: {code}{at_channel}" + _REMEDIES.get(code, ""),
+        channel=channel,
+        may_play=may_play,
+        is_disarmed=code in _NOT_ARMED,
+    )
+
+
+def no_reply(
+    where: str, name: str, timeout: float, remark: str, *, before: float, boot_time: float
+) -> str:
+    """Return why the request with this name had no reply within a timeout [s].
+
+    where: the line, as the message begins. remark: what arrived instead. before: how long the
+    previous reply took [s]. boot_time: how long a board may take to boot [s] if its port was
+    opened just now, else 0.
+    """
+    if not remark and before > timeout:
+        remark = f"the previous reply took {1e3 * before:.0f} ms: find the cause of the delay"
+    hint = "check that the amplifier is switched on"
+    if name == "GetCaps":  # sent after a reply to Hello
+        hint = "it answered Hello, but not GetCaps"
+    came = f", but {remark}" if remark else f"; {hint}"
+    cause = f"{where}: no reply within {1e3 * timeout:g} ms{came}"
+    if boot_time:
+        cause += (
+            f". A board that restarts when its port is opened must reply within {boot_time:g} s; "
+            "if it takes longer, disable the restart"
+        )
+    return cause
+
+
 def system_message(error: BaseException) -> str:
     """Return the operating system's message of an error, without its number."""
     return re.sub(r"^.*\[Errno -?\d+\] ", "", str(error), flags=re.DOTALL)

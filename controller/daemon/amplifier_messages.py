@@ -15,8 +15,8 @@ from controller.operation.operation_states import Loss
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.ledger import StopOutcome
-from drivers.host.line import LinkStatistics
 from drivers.host.members import is_lost
+from drivers.host.requests import LinkStatistics
 from drivers.protocol.definition import FAULTS, QUANTITIES, READINGS, STATES, has_flag, name_of
 from drivers.protocol.records import Values
 from registry import threads

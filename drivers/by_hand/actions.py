@@ -24,7 +24,7 @@ from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_r
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.ledger import StagedSet, StopOutcome
-from drivers.host.line import Priority
+from drivers.host.requests import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
     BOOT_TIME,

@@ -43,7 +43,8 @@ from drivers.host.ledger import (
     check_capabilities,
     check_identity,
 )
-from drivers.host.line import Line, LinkStatistics, Priority
+from drivers.host.line import Line
+from drivers.host.requests import LinkStatistics, Priority
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     ATTEMPTS,

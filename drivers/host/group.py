@@ -27,8 +27,8 @@ from drivers.host.group_states import REACTIONS, Failure, GroupState
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.joint_sets import JointSets, PlayedSet, UnplayedSet
 from drivers.host.ledger import StopOutcome
-from drivers.host.line import Priority
 from drivers.host.members import Members, is_lost, outcomes
+from drivers.host.requests import Priority
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, QUANTITIES, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values

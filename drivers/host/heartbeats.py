@@ -16,8 +16,9 @@ from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.group_clocks import Clocks
 from drivers.host.joint_sets import JointSets, commit_of, word_passed_by_all
-from drivers.host.line import GRACE, Line, Make, Priority
+from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
+from drivers.host.requests import Make, Priority
 from drivers.protocol.definition import HEARTBEAT
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token

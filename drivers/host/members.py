@@ -12,7 +12,8 @@ from typing import Any, ParamSpec, TypeVar, cast
 from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.ledger import StopOutcome
-from drivers.host.line import Line, Priority
+from drivers.host.line import Line
+from drivers.host.requests import Priority
 from drivers.protocol.records import Values
 from registry import threads
 

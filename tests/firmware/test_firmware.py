@@ -30,7 +30,8 @@ from cobs import cobs
 from cases import shortly
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
-from drivers.host.line import Line, Priority
+from drivers.host.line import Line
+from drivers.host.requests import Priority
 from drivers.opening import Lines
 from drivers.protocol.definition import (
     BY_NUMBER,

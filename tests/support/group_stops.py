@@ -27,7 +27,7 @@ from drivers.by_hand import actions
 from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.ledger import SILENCING_TIME, StopOutcome
-from drivers.host.line import Priority
+from drivers.host.requests import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES
 from drivers.protocol.sets import Envelope

@@ -24,7 +24,7 @@ from drivers.errors import LinkTimeout
 from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
 from drivers.host.ledger import Ledger, StopOutcome
-from drivers.host.line import Priority
+from drivers.host.requests import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values

@@ -18,7 +18,7 @@ import pytest
 
 from drivers.errors import CommandError, CommandRefused, LinkTimeout
 from drivers.host.ledger import Ledger
-from drivers.host.line import Job, Priority
+from drivers.host.requests import Job, Priority
 from drivers.playing import AmplifierLayer, AmplifierTone, Playback
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames
@@ -645,6 +645,6 @@ async def test_error_of_a_port_that_takes_nothing_names_what_to_check(
 async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:
     """Of requests that wait; what reads goes on waiting."""
     result = asyncio.get_running_loop().create_future()
-    waiting = [Job(None, priority, "", {}, 0.03, 0.0, result=result) for priority in Priority]
+    waiting = [Job(None, priority, "", 0.03, 0.0, result=result) for priority in Priority]
     obsolete = {job.priority for job in waiting if job.is_superseded_by(Priority.STOP, None)}
     assert obsolete == {Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR}

@@ -20,7 +20,8 @@ import pytest
 
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
-from drivers.host.line import Line, Priority
+from drivers.host.line import Line
+from drivers.host.requests import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope

@@ -165,7 +165,8 @@ async def firmware_skew(seconds: float) -> tuple[float, float]:
             name: await stack.enter_async_context(running_firmware(find_firmware(), name))
             for name in NAMES
         }
-        controller = make_controller(make_rig(NAMES), urls, connected=watch)
+        controller = make_controller(make_rig(NAMES), urls)
+        controller.connected.append(watch)
         await controller.open()
         loop = asyncio.create_task(controller.cycle.run())
         await controller.arm()

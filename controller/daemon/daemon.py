@@ -99,13 +99,6 @@ class Daemon:
         self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self.supervisor = Supervisor(
-            state_changed=(self._publish_state, self._notify_manager),
-            link_changed=lambda *change: self.publisher.link_changed(*change),
-            alive=lambda: manager.alive(threads.now()),
-        )
-        self.started = self.supervisor.started
-        """Set once it serves, and its amplifiers are open or searched for."""
         self.layouts = LayoutChoice(self.config, table.frequencies, changed=self._layout_changed)
         self.publisher = EventPublisher(
             operation=lambda: self.supervisor.operation,
@@ -119,16 +112,21 @@ class Daemon:
             lines=lines,
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
-            connected=self.supervisor.connected,
             intent_source=self.layouts.player,
             timing=Timing(table),
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
-        self.supervisor.controller = self.controller
+        self.supervisor = Supervisor(
+            self.controller,
+            state_changed=(self._publish_state, self._notify_manager),
+            link_changed=lambda *change: self.publisher.link_changed(*change),
+            alive=lambda: manager.alive(threads.now()),
+        )
+        self.started = self.supervisor.started
+        """Set once it serves, and its amplifiers are open or searched for."""
         cycle = self.controller.cycle
         cycle.tracker.max_fingers = config.section.max_fingers
-        self.supervisor.observe(cycle.observers)
         self.publisher.observe(cycle.observers)
         observe(cycle.observers)
         self.inputs = TouchInputs(

@@ -74,7 +74,7 @@ class Trigger(Enum):
     ARM = auto()  # requested
     ARMED = auto()  # every amplifier has confirmed
     DISARM = auto()  # requested, or the arming lease was not renewed
-    STOP = auto()  # requested
+    STOP = auto()  # requested; the amplifiers are being stopped already
     CLEAR = auto()  # acknowledgement requested
     FAULT = auto()  # reported by an amplifier or the control loop
     REACTION_DONE = auto()  # the fault reaction is complete
@@ -214,9 +214,9 @@ TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
         Action.DISARM,
         Action.VERIFY,
     ),
-    # `Supervisor.stop` queues the stop before this event, and does not carry out the action again.
-    **_from(DaemonState, Trigger.STOP, None, Action.STOP),
-    **_from((*_SILENT, *ENERGISED), Trigger.STOP, DaemonState.QUICK_STOP_ACTIVE, Action.STOP),
+    # `Supervisor.stop` queues the stop before this event.
+    **_from(DaemonState, Trigger.STOP, None),
+    **_from((*_SILENT, *ENERGISED), Trigger.STOP, DaemonState.QUICK_STOP_ACTIVE),
     **_from(
         (*_SILENT, *ENERGISED, DaemonState.QUICK_STOP_ACTIVE),
         Trigger.FAULT,
@@ -274,6 +274,19 @@ def failed(operation: Operation, cause: str) -> Operation:
     if operation.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         return replace(operation, is_latched=True, epoch=epoch)
     return Operation(DaemonState.FAULT, cause, fault_remedy(cause), is_latched=True, epoch=epoch)
+
+
+def not_reopened(
+    operation: Operation, error: Exception, remedy: str, names: tuple[str, ...]
+) -> Operation:
+    """Return the operation after lost amplifiers could not be reopened; names: of those, if known.
+
+    The cause of the loss itself is kept.
+    """
+    if operation.lost is None:
+        return operation
+    lost = operation.lost._replace(names=names or operation.lost.names)
+    return replace(operation, cause=str(error), remedy=remedy, lost=lost)
 
 
 def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operation:

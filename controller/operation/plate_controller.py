@@ -39,7 +39,6 @@ class Controller:
     timing: shapes the patterns of the table.
     urls, serial_numbers: by amplifier name.
     drive_mode: None for the best mode that the amplifiers support.
-    connected: called with all amplifiers once their lines are open.
     watchdog: watchdog time of armed amplifiers [s].
     """
 
@@ -54,7 +53,6 @@ class Controller:
         urls: Mapping[str, str] | None = None,
         serial_numbers: Mapping[str, str] | None = None,
         drive_mode: str | None = None,
-        connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
         watchdog: float = WATCHDOG,
     ) -> None:
         self.cycle = Cycle(rig.plate, Group({}, watchdog=watchdog))
@@ -77,7 +75,8 @@ class Controller:
         self._pending_stops: dict[str, asyncio.Future[_Stopping]] = {}
         """Stops that wait for the line of an amplifier; each gets its result when it opens."""
         self._serial_numbers = dict(serial_numbers or {})
-        self._connected = connected
+        self.connected: list[Callable[[Mapping[str, Amplifier]], None]] = []
+        """Observers; called with all amplifiers once their lines are open."""
         self.watchdog = watchdog
         """Watchdog of armed amplifiers [s]."""
         self.amplifiers: dict[str, Amplifier] = {}
@@ -152,7 +151,8 @@ class Controller:
             error.lost = tuple(errors)
         opened = self.group.members.checked(results)
         amplifiers = dict(zip(self.urls, opened, strict=True))
-        self._connected(amplifiers)
+        for observer in self.connected:
+            observer(amplifiers)
         await self.group.open()
         for name, amplifier in amplifiers.items():
             self._serial_numbers[name] = amplifier.identity["serial_number"]

@@ -1,8 +1,8 @@
 """Supervisor of a plate: its operation, its links, and the handling of faults and losses.
 
-Only the supervisor changes the operation. An event changes it (`step`), the controller carries out
-the resulting actions, and the outcome of each action at the amplifiers is the next event. Actions
-come before observers, which are called a moment later, each guarded (`DeferredCalls`).
+Only the supervisor replaces the operation. An event replaces it (`step`), the controller carries
+out the resulting actions, and the outcome of each action at the amplifiers is the next event.
+Actions come before observers, which are called a moment later, each guarded (`DeferredCalls`).
 
 Actions run in tasks of their own (`_spawn`). A caller that is cancelled, such as the request of a
 client that has left, stops waiting, but the task continues to its end. `run` waits for all tasks
@@ -32,11 +32,11 @@ from controller.operation.operation_states import (
     Trigger,
     failed,
     fault_remedy,
+    not_reopened,
     step,
 )
 from controller.operation.plate_controller import Controller
 from controller.operation.read_back import are_silent, find_problem, is_any_armed
-from controller.play.reports import Observers
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -82,27 +82,27 @@ _T = TypeVar("_T")
 class Supervisor:
     """Operates the amplifiers of a controller: applies events, and keeps the links open.
 
-    Create the controller with the supervisor's `connected`, set `controller`, and call `observe`
-    before any other observer. An unexpected exception in a transition or action stops all
-    amplifiers and ends in FAULT.
+    It observes the control loop before all other observers. An unexpected exception in a transition
+    or action stops all amplifiers and ends in FAULT.
 
+    controller: opens, arms and stops the amplifiers.
     state_changed: called shortly after every change of the state or its epoch.
     link_changed: receives the kind of change, the affected amplifiers, if known, and a message.
     alive: called after each cycle of the control loop, which runs in every state.
     """
 
-    controller: Controller
-    """Opens, arms and stops the amplifiers; set it first, because it is made with `connected`."""
-
     def __init__(
         self,
+        controller: Controller,
         *,
         state_changed: Sequence[StateObserver],
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
     ) -> None:
+        self.controller = controller
         # Differs from the epochs of an earlier daemon, whose clients may reconnect.
         self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
+        """The current operation; only `_replace_operation` changes it."""
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
         self.closing = asyncio.Event()
         self._changed = asyncio.Event()  # set by a change of state, cleared by `run`
@@ -114,14 +114,13 @@ class Supervisor:
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
         self._clears: list[int] = []  # epochs of clears in progress
         self._lease_timer: asyncio.TimerHandle | None = None
+        controller.connected.insert(0, self._listen)
+        loop = controller.cycle.observers
+        loop.refused.insert(0, self._check_own_stop)
+        loop.link_lost.insert(0, self._link_lost)
+        loop.cycle_completed.insert(0, self._cycle_completed)
 
-    def observe(self, loop: Observers) -> None:
-        """Follow refusals, losses and cycles of the control loop."""
-        loop.refused.append(self._check_own_stop)
-        loop.link_lost.append(self._link_lost)
-        loop.cycle_completed.append(self._cycle_completed)
-
-    def connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
+    def _listen(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Listen to amplifiers, by name, whose lines have just been opened."""
         for name, amplifier in amplifiers.items():
             amplifier.listeners = [partial(self._amplifier_event, name)]  # of each attempt
@@ -177,16 +176,18 @@ class Supervisor:
     def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, StopOutcome]]:
         """Quick-stop all amplifiers in any state; await the outcome of each, by name.
 
-        The requests to the amplifiers are queued when this returns.
+        The requests to the amplifiers are queued when this returns. They come before the event, so
+        that no failure of the transition can delay them; the event therefore has no action.
         """
         stopping = self._spawn(self._stopped(self.controller.stop_all()))
         self.step(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
 
     def stop_anyhow(self) -> Awaitable[object]:
-        """Stop all amplifiers, and latch that, if a client's stop request has failed on its way.
+        """Stop all amplifiers, and latch that, after `stop` has failed for a client.
 
-        The failure may lie in `stop_all`, so this calls `group.stop` directly.
+        The failure may lie in `stop_all`, which also waits for closed lines to open. So this calls
+        only what `stop_all` begins with, and the requests do not depend on the transition.
         """
         cause = "stopped, though the request failed on its way"
         try:
@@ -197,7 +198,7 @@ class Supervisor:
     def renew(self, lease: Lease) -> Lease:
         """Return the lease of the client that armed, renewed; it must not have ended."""
         renewed = lease.renewed(threads.now())
-        self.operation = replace(self.operation, lease=renewed)
+        self._replace_operation(replace(self.operation, lease=renewed))
         return renewed
 
     def withdraw(self, token: str, cause: str) -> None:
@@ -225,25 +226,26 @@ class Supervisor:
 
     def step(self, event: DaemonEvent) -> tuple[Action, ...]:
         """Apply one transition; return its actions."""
-        last_operation = self.operation
         try:
-            self.operation, actions = step(last_operation, event, threads.now())
+            operation, actions = step(self.operation, event, threads.now())
         except Exception as error:
-            self.operation = failed(last_operation, failure_text(error))
+            operation = failed(self.operation, failure_text(error))
             actions = (Action.STOP,)
-        self._report_transition(last_operation)
+        self._replace_operation(operation)
         return actions
 
-    def _report_transition(self, last_operation: Operation) -> None:
-        """Notify the observers of a new epoch, deferred; watch a lease that has begun."""
-        if self.operation.epoch == last_operation.epoch:
+    def _replace_operation(self, operation: Operation) -> None:
+        """Adopt an operation; notify the observers of a new epoch, and watch a new lease."""
+        last_operation = self.operation
+        self.operation = operation
+        if operation.epoch == last_operation.epoch:
             return
         self._changed.set()
         for observer in self._state_observers:
-            self._reports.add(partial(observer, last_operation, self.operation))
+            self._reports.add(partial(observer, last_operation, operation))
         if self._lease_timer is not None:
             self._lease_timer.cancel()
-        if self.operation.state is DaemonState.OPERATION_ENABLED:
+        if operation.state is DaemonState.OPERATION_ENABLED:
             self.check_lease()
 
     def check_lease(self) -> None:
@@ -258,9 +260,7 @@ class Supervisor:
 
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
-        last_operation = self.operation
-        self.operation = failed(last_operation, failure_text(error))
-        self._report_transition(last_operation)
+        self._replace_operation(failed(self.operation, failure_text(error)))
         await asyncio.shield(self._spawn(self._stop()))
         if self.operation.state is DaemonState.COMM_LOST:  # what should have closed them has failed
             await self._carry_out([Action.RECONNECT], self.operation.epoch)
@@ -306,23 +306,33 @@ class Supervisor:
                     await self.controller.close()
 
     async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
-        """Await work that needs the link; a loss or refusal becomes an event, then is raised.
-
-        A refusal is no event if a later epoch or a stop in progress explains it.
-        """
+        """Await work of an epoch that needs the link; handle the event of its error, and raise."""
         try:
             await work
-        except LinkError as error:
-            if isinstance(error, LinkDegraded) and self.operation.state is DaemonState.SWITCHED_ON:
-                await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
-            else:
-                await self._handle_loss(error)
-            raise
         except DriverError as error:
-            is_stopping = isinstance(error, Preempted) and self.operation.is_latched
-            if epoch == self.operation.epoch and not is_stopping:
-                await self.handle(DaemonEvent(Trigger.FAULT, str(error)))
+            match self._trigger_of(error, epoch):
+                case Trigger.LINK_LOST:
+                    await self._handle_loss(error)
+                case Trigger.DISARM:
+                    cause = "an amplifier did not reply to arm"
+                    await self.handle(DaemonEvent(Trigger.DISARM, cause))
+                case Trigger.FAULT:
+                    await self.handle(DaemonEvent(Trigger.FAULT, str(error)))
             raise
+
+    def _trigger_of(self, error: DriverError, epoch: int) -> Trigger | None:
+        """Return the kind of event that an error of an action is; None if it is expected.
+
+        epoch: when the action began. A later epoch, or a stop in progress, explains an error.
+        """
+        if isinstance(error, LinkDegraded) and self.operation.state is DaemonState.SWITCHED_ON:
+            return Trigger.DISARM
+        if isinstance(error, LinkError):
+            return Trigger.LINK_LOST
+        is_stopping = isinstance(error, Preempted) and self.operation.is_latched
+        if epoch != self.operation.epoch or is_stopping:
+            return None
+        return Trigger.FAULT
 
     async def _arm(self) -> None:
         await self.controller.arm()
@@ -447,14 +457,7 @@ class Supervisor:
             await self.controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             names = self._not_opened(error)
-            lost = self.operation.lost
-            if lost is not None:
-                self.operation = replace(
-                    self.operation,
-                    cause=str(error),
-                    remedy=_remedy_of(error),
-                    lost=lost._replace(names=names or lost.names),
-                )
+            self._replace_operation(not_reopened(self.operation, error, _remedy_of(error), names))
             if self.controller.group.is_open:
                 await self.controller.release()
             return False
@@ -474,7 +477,7 @@ class Supervisor:
                 await self._changed.wait()
                 self._changed.clear()
 
-    async def _handle_loss(self, error: LinkError) -> None:
+    async def _handle_loss(self, error: DriverError) -> None:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
             group = self.controller.group

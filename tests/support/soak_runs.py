@@ -528,17 +528,16 @@ class Soak(Chain):
 
     def make_host(self, **more: Any) -> None:
         """Make a supervisor with its control loop."""
-        supervisor = self.supervisor = Supervisor(
+        super().make_host(**more)
+        self.supervisor = Supervisor(
+            self.controller,
             state_changed=(lambda old, new: self.note("state", new.state),),
             link_changed=self._link_changed,
             alive=lambda: None,
         )
-        super().make_host(connected=supervisor.connected, **more)
         loop = self.controller.cycle.observers
-        supervisor.observe(loop)
         loop.reported.append(self._applied)
         loop.refused.append(lambda why: self.note("observer refused", why))
-        supervisor.controller = self.controller
 
     async def open(self) -> None:
         """Have the supervisor open all wires, and run the control loop."""

@@ -182,15 +182,15 @@ async def test_stop_says_what_is_known(state: str) -> None:
 # own.
 EVENTS = """
 OPENED NOT_FOUND VERIFIED ARM ARMED DISARM STOP CLEAR FAULT REACTION_DONE LINK_LOST CLOSE
-NOT_READY             SD:v CL:n .    .    .   .     =:s  .   .    .   .     NR:x
-SWITCH_ON_DISABLED    .    .    RS:  .    .   .     QS:s .   FR:r .   CL:sn NR:x
-READY_TO_SWITCH_ON    .    .    .    SO:a .   .     QS:s .   FR:r .   CL:n  NR:x
-SWITCHED_ON           .    .    .    .    OE: SD:dv QS:s .   FR:r .   CL:sn NR:x
-OPERATION_ENABLED     .    .    .    .    .   SD:dv QS:s .   FR:r .   CL:sn NR:x
-QUICK_STOP_ACTIVE     .    .    SD:v .    .   .     =:s  =:c FR:r .   CL:sn NR:x
-FAULT_REACTION_ACTIVE .    .    .    .    .   .     =:s  .   .    FA: CL:sn NR:x
-FAULT                 .    .    SD:v .    .   .     =:s  =:c =:s  .   CL:sn NR:x
-COMM_LOST             .    .    .    .    .   .     =:s  .   .    .   =:n   NR:x
+NOT_READY             SD:v CL:n .    .    .   .     =:   .   .    .   .     NR:x
+SWITCH_ON_DISABLED    .    .    RS:  .    .   .     QS:  .   FR:r .   CL:sn NR:x
+READY_TO_SWITCH_ON    .    .    .    SO:a .   .     QS:  .   FR:r .   CL:n  NR:x
+SWITCHED_ON           .    .    .    .    OE: SD:dv QS:  .   FR:r .   CL:sn NR:x
+OPERATION_ENABLED     .    .    .    .    .   SD:dv QS:  .   FR:r .   CL:sn NR:x
+QUICK_STOP_ACTIVE     .    .    SD:v .    .   .     =:   =:c FR:r .   CL:sn NR:x
+FAULT_REACTION_ACTIVE .    .    .    .    .   .     =:   .   .    FA: CL:sn NR:x
+FAULT                 .    .    SD:v .    .   .     =:   =:c =:s  .   CL:sn NR:x
+COMM_LOST             .    .    .    .    .   .     =:   .   .    .   =:n   NR:x
 """
 STATE_CODES = {
     "NR": DaemonState.NOT_READY,
@@ -459,14 +459,14 @@ def test_supervisor_keeps_to_its_course(name: str) -> None:
 
 def slow_down(controller: Controller, *, stop: float) -> None:
     """Let stopping the amplifiers take so long [s]."""
-    stop_now = controller.stop
+    stop_now = controller.stop_all
 
     async def slow_stop() -> Mapping[str, StopOutcome]:
         stopped = await stop_now()
         await asyncio.sleep(stop)
         return stopped
 
-    controller.stop = slow_stop
+    controller.stop_all = slow_stop
 
 
 @in_virtual_time
@@ -559,7 +559,7 @@ async def test_clear_does_not_acknowledge_a_stop_since_its_statuses(
         async def stopped_since() -> dict[str, Values]:
             statuses = await read()
             monkeypatch.setattr(group, "statuses", read)
-            daemon.supervisor.post(STOP)
+            daemon.supervisor.stop("a test")
             return statuses
 
         monkeypatch.setattr(group, "statuses", stopped_since)

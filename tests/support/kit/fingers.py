@@ -764,8 +764,11 @@ class Watched(Acted):
             await super().take(step)
 
     async def handle(self, event: DaemonEvent) -> None:
-        """Let the supervisor handle an event."""
-        await self.supervisor.handle(event)
+        """Let the supervisor handle an event, and a stop as a client's."""
+        if event.trigger is Trigger.STOP:
+            await self.supervisor.stop(event.cause)
+        else:
+            await self.supervisor.handle(event)
 
     async def does(self, trigger: str) -> None:
         """Let the supervisor handle an event of this kind."""
@@ -828,14 +831,13 @@ async def watched(
             raise Planted(name)
         getattr(daemon, name).append(value)
 
-    supervisor = Supervisor(
-        state_changed=[lambda old, new: heard("states", new.state)],
-        link_changed=lambda event, lost, message: heard("links", event),
-        alive=lambda: heard("alive", threads.now()),
-    )
-    options = {"connected": supervisor.connected, "observe": supervisor.observe, **options}
     async with set_chain(*amplifiers, of=Watched, **options) as daemon:
-        daemon.supervisor, supervisor.controller = supervisor, daemon.controller
+        daemon.supervisor = supervisor = Supervisor(
+            daemon.controller,
+            state_changed=[lambda old, new: heard("states", new.state)],
+            link_changed=lambda event, lost, message: heard("links", event),
+            alive=lambda: heard("alive", threads.now()),
+        )
         loop = daemon.controller.cycle.observers
         loop.cycle_completed.append(lambda: heard("cycles", threads.now()))
         loop.refused.append(lambda reason: heard("refused", reason))

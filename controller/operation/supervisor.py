@@ -145,7 +145,8 @@ class Supervisor:
                 else:
                     await self._poll()
         finally:
-            await asyncio.gather(*self.tasks, return_exceptions=True)
+            while self.tasks:  # a task may start another one
+                await asyncio.gather(*self.tasks, return_exceptions=True)
             loop.cancel()
             await asyncio.gather(loop, return_exceptions=True)
             self._reports.flush()

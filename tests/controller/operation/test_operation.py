@@ -658,3 +658,22 @@ async def test_reports_of_an_amplifier_are_shown(caplog: pytest.LogCaptureFixtur
         daemon.obey()
         await asyncio.sleep(11)
         assert not reports()
+
+
+@in_virtual_time
+async def test_run_waits_for_a_task_that_another_task_starts_at_the_end() -> None:
+    """Nothing that a task has begun is left behind when the supervisor has ended."""
+    ended = list[str]()
+    async with watched() as daemon:
+        spawn = daemon.supervisor._spawn
+
+        async def check() -> None:
+            await asyncio.sleep(0.1)
+            ended.append("check")
+
+        async def stop() -> None:
+            await asyncio.sleep(1)
+            spawn(check())
+
+        spawn(stop())
+    assert ended == ["check"]

@@ -136,8 +136,11 @@ class Members:
         """Request a stop of all amplifiers of a line along a ramp [s], unless one is queued."""
         queued = self._broadcasts.get(line)
         if queued is None or queued.done():
-            first = next(iter(self.amplifiers.values()))
-            sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
+            wire_ramp = 0  # each amplifier shortens a ramp that is too long for it
+            for amplifier in self.amplifiers.values():
+                if amplifier.line is line:
+                    wire_ramp = max(wire_ramp, amplifier.wire_ramp(ramp))
+            sent = line.submit(None, Priority.STOP, "Stop", {"ramp": wire_ramp})
             # Its error does not matter: the replies of the amplifiers to their own stops decide.
             sent.add_done_callback(lambda sent: sent.cancelled() or sent.exception())
             self._broadcasts[line] = sent

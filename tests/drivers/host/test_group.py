@@ -513,6 +513,21 @@ def calls(file: Path, part: str) -> Iterator[tuple[str, ast.Call]]:
             yield getattr(called, "attr", "") or getattr(called, "id", ""), node
 
 
+@in_virtual_time
+async def test_broadcast_stop_has_the_longest_ramp_of_its_own_line() -> None:
+    """An amplifier with a short longest ramp on another line does not shorten it."""
+    lines = [MemoryLine("serial", *names) for names in ("a", "bc")]
+    lines[0].far["a"].capabilities["ramp_max"] = 10  # ms
+    group = await group_of(*lines)
+    await group.apply({name: [layer(0, tone(level=0.5))] for name in "abc"})
+    stopping = asyncio.ensure_future(group.stop(0.2))
+    await asyncio.sleep(0.1)
+    assert lines[0].levels("a")[0] == 0.0
+    assert lines[1].levels("b")[0] > 0.0
+    stopped = await stopping
+    assert all(outcome.is_confirmed for outcome in stopped.values())
+
+
 def test_only_wires_use_encoders() -> None:
     """`encode_...` and `pack_...` are called by wires, codecs and the table, not from above."""
     users = {

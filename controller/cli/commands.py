@@ -21,7 +21,6 @@ from controller.cli.daemon_cli import (
     watch,
 )
 from controller.cli.demo import demo
-from controller.cli.rig_cli import rig_app
 from drivers.by_hand import cli as by_hand
 from model.errors import InputError
 
@@ -95,7 +94,6 @@ EXIT_STATUS = {**by_hand.EXIT_STATUS, InputError: 2}
 
 app = typer.Typer()
 app.add_typer(layout_app, name="layout")
-app.add_typer(rig_app, name="rig")
 app.command(cls=DashboardCommand)(daemon)
 app.command(cls=DashboardCommand)(demo)
 for _command in (gateway, touch, watch):

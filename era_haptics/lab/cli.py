@@ -11,6 +11,7 @@ from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.measuring.measure_cli import measure, outputs
+from era_haptics.lab.measuring.rig_cli import rig_app
 from model.errors import InputError
 
 
@@ -55,6 +56,7 @@ app = typer.Typer()
 app.add_typer(amp, name="amp")
 app.add_typer(content_app, name="content")
 app.add_typer(layout_app, name="layout")
+app.add_typer(rig_app, name="rig")
 app.add_typer(design_app)
 for _command in (play, report, measure, outputs):
     app.command()(_command)

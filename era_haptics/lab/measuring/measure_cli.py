@@ -2,25 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from controller.cli import rig_cli
 from model.commands.options import JsonOption, RigArgument, next_line, print_report
 from model.errors import InputError
-
-if TYPE_CHECKING:
-    from model.estimate.measurement import MeasuredPlate
-
-
-def _measure_plate(*given: Any, **named: Any) -> "MeasuredPlate":
-    from era_haptics.lab.measuring.measure import measure_plate
-
-    return measure_plate(*given, **named)
-
-
-rig_cli.measure_by_card = _measure_plate
 
 
 def measure(

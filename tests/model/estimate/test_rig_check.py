@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 
 from cases import read_yaml, shortly
-from controller.cli import rig_cli
 from era_haptics.command import run_era
-from era_haptics.lab.measuring import measure_cli as measure_cli  # sets `measure_by_card`
+from era_haptics.lab.measuring import measure
 from examples.make_measured import Accelerometer, record_responses, scanning_grid
 from kit.plates import (
     DISTORTIONS,
@@ -429,7 +428,7 @@ def test_commands_say_why_they_write_no_rig(
     found = measured(true, 1)
     found.values[..., 2] *= 1e-4 if is_dead else 1
     here = MeasuredPlate(found, None, None, (), (), {})
-    monkeypatch.setattr(rig_cli, "measure_by_card", lambda *_, **__: here)
+    monkeypatch.setattr(measure, "measure_plate", lambda *_, **__: here)
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, found, WEEKEND)
     rig = shutil.copy(FOLDER / "rig.yaml", tmp_path)

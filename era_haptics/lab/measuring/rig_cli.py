@@ -5,7 +5,7 @@ contains. `show` and `merge` use the result of a fit. `check` compares responses
 """
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
@@ -22,20 +22,6 @@ if TYPE_CHECKING:
     from model.estimate.identify import Identification
     from model.estimate.measurement import MeasuredPlate, Measurement
     from model.rig.rig import Rig
-
-measure_by_card: "Callable[..., MeasuredPlate] | None" = None
-"""Measures a plate through a sound card; set by the lab, which implements sound cards."""
-
-_NOT_EXPLAINED = (
-    "chi² must be at most 2 for a plate that the model explains; no rig is written. Check that "
-    "nothing touches the plate, and run era rig check to verify that plate and wiring match the "
-    "file"
-)
-_NOT_KNOWN = (
-    "modes must match the rig's plate within 2 standard deviations; no rig is written. The fields "
-    "between the sensors are unknown: remove parts bonded to the plate, such as a frame along its "
-    "edges, or use the rig unchanged; sensors away from the edges locate the difference"
-)
 
 
 def identify(
@@ -114,10 +100,12 @@ def identify(
     nothing is played. Exits with status 1 and writes no rig if the model does not explain the
     responses.
     """
+    from era_haptics.lab.measuring.measure import measure_plate
     from model.config.units import parse_frequencies
     from model.rig.rig_file import load_rig
     from model.structure.modal_elasticity import check_measurable
 
+    card: tuple[str, Path] | None = None  # the sound card, and the file of its sensors
     if measured_file is not None:
         played = {"--level": level, "--device": device}
         _reject(played, rule="plays; leave it out with --measured")
@@ -128,20 +116,20 @@ def identify(
         _reject(recorded, rule="needs --device")
     elif sensors_file is None:
         raise InputError("--device needs --sensors, a file of the accelerometers")
+    else:
+        card = device, sensors_file
     tones = parse_frequencies(frequencies) if frequencies else None
     rig = load_rig(rig_file)
     check_measurable(rig.plate)
     check_rig_output(output, rig_file)
     if measured_file is not None:
         measured = _read_measured_plate(measured_file, rig)
-    else:
+    elif card is not None:
         _require_untouched(is_confirmed=untouched, has_terminal=not as_json)
-        assert measure_by_card is not None  # noqa: S101  the lab is loaded
         with progress_bar("runs") as progress:
-            measured = measure_by_card(
+            measured = measure_plate(
                 rig,
-                device,
-                sensors_file,
+                *card,
                 frequencies=tones,
                 level=level,
                 periods=periods or 2,
@@ -164,7 +152,7 @@ def _identify_measured(
     import time
 
     from model.estimate import fit_report
-    from model.estimate.identify import identification_errors
+    from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, identification_errors
     from model.study.expected_contrast import expected_contrast
 
     started = time.perf_counter()
@@ -186,9 +174,18 @@ def _identify_measured(
         errors = identification_errors(identification)
         files = write_fitted_rig(output, (rig, identification.rig), comment, errors)
     elif identification.is_known_well:
-        refusal = _NOT_EXPLAINED
+        refusal = (
+            f"chi² must be at most {MAX_CHI2:g} for a plate that the model explains; no rig is "
+            "written. Check that nothing touches the plate, and run era rig check to verify that "
+            "plate and wiring match the file"
+        )
     else:
-        refusal = _NOT_KNOWN
+        refusal = (
+            f"modes must match the rig's plate within {MAX_MODE_SHIFT:g} standard deviations; no "
+            "rig is written. The fields between the sensors are unknown: remove parts bonded to "
+            "the plate, such as a frame along its edges, or use the rig unchanged; sensors away "
+            "from the edges locate the difference"
+        )
     report: dict[str, Any] | None = None
     if as_json:
         report = fit_report.identification_json(identification, expected) | _measured_json(measured)

@@ -7,6 +7,7 @@ from controller.api.link import LeaseLost as LeaseLost
 from controller.api.link import Notification as Notification
 from controller.api.link import Unreachable as Unreachable
 from drivers.by_hand.actions import BlockingAmplifier as BlockingAmplifier
+from drivers.errors import CommandError as CommandError
 from drivers.errors import CommandRefused as CommandRefused
 from drivers.errors import DriverError as DriverError
 from drivers.errors import LinkError as LinkError
@@ -37,6 +38,7 @@ from model.answer.answer_report import Measures as Measures
 from model.answer.stimulus import Course as Course
 from model.answer.stimulus import Finger as Finger
 from model.answer.stimulus import Stimulus as Stimulus
+from model.config.document import ConfigError as ConfigError
 from model.errors import InputError as InputError
 from model.estimate.calibrate import Calibration as Calibration
 from model.finger import Grid as Grid

@@ -61,7 +61,7 @@ def open_amplifier(
 
     name: optional if the rig has only one; url: replaces the rig's; `sim://` simulates the
     amplifier on a plate of its own. Commands beyond the rig's limits are rejected. Raises
-    InputError for an unknown name. Entering the block raises DriverError for an invalid URL,
+    InputError for an unknown name. Entering the block raises CommandError for an invalid URL,
     LinkError if there is no reply, and CommandRefused if the amplifier rejects a request.
 
     Example:

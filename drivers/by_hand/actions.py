@@ -291,7 +291,11 @@ class BlockingAmplifier:
         return capability_rows(self._amplifier.capabilities)
 
     def arm(self, watchdog: float = WATCHDOG) -> dict[str, Any]:
-        """Switch the high voltage on, level zero; watchdog [s]. Returns the status."""
+        """Switch the high voltage on, level zero; watchdog [s]. Returns the status.
+
+        Raises CommandError if the watchdog is too short or too long, and CommandRefused after a
+        stop or a fault that was not cleared.
+        """
         return status_rows(self._wait(self._amplifier.arm(random_session(), watchdog)))
 
     def disarm(self) -> None:
@@ -324,8 +328,9 @@ class BlockingAmplifier:
     def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         """Play only these layers from now on; returns them as rounded for the wire.
 
-        Raises DriverError if the amplifier's steps are too coarse: its only levels are zero and
-        full level, or a phase would be off by more than 5 degrees.
+        Raises CommandRefused beyond the limits, and CommandError if the amplifier's steps are too
+        coarse: its only levels are zero and full level, or a phase would be off by more than 5
+        degrees.
         """
         return self._wait(self._applied(layers))
 

@@ -334,6 +334,18 @@ def test_page_rig_needs_no_file(
     assert contrasts == sorted(contrasts)
 
 
+def test_page_lists_every_exception_with_its_base() -> None:
+    """A row `NAME` (a `BASE`) for each exception that the package exports."""
+    rows = re.findall(r"^\| `(\w+)`(?: \(an? `(\w+)`\))? \|", PAGE, re.MULTILINE)
+    exported = {}
+    for name in era.__all__:
+        kind = getattr(era, name)
+        if isinstance(kind, type) and issubclass(kind, Exception):
+            exported[name] = {base.__name__ for base in kind.__mro__}
+    assert {name for name, _ in rows} == exported.keys()
+    assert all(base in {"", *exported[name]} for name, base in rows)
+
+
 def test_page_documents_every_name() -> None:
     """Exactly the exported names."""
 

@@ -29,7 +29,7 @@ from controller.play.joint_answers import (
 )
 from controller.play.routing import PlaybackCapabilities
 from model.answer.answer import APART_HZ, Answer
-from model.answer.plan import scaled
+from model.answer.answer_levels import scaled
 from model.arrays import NEARLY
 from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable

@@ -8,26 +8,23 @@ each only if the previous ones leave room for it. A vibration that could not be 
 finger anyway comes last. If not even the first can be served, the best answer tried is returned,
 except that bounds set by fingers always hold, by silence if necessary.
 
-Then follow modulation, by a carrier and two side bands, and the levels: as strong as quiet fingers
-allow, and within the amplifiers' limits. At full modulation each side band has half the carrier's
-amplitude. With the carrier's weights, side bands would leak 3 to 12 dB more, so each side band has
-separate weights, computed like those of a content at its frequency. The carrier is chosen for all
-three together, near the best steady one.
+Then follow modulation (`model.answer.modulation`) and the levels: as strong as quiet fingers allow,
+and within the amplifiers' limits (`model.answer.answer_levels`).
 """
 
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
+from itertools import filterfalse
 from typing import Any
 
 import numpy as np
 
 from model.answer.answer import (
     APART_HZ,
-    IMPERCEPTIBLE_DB_SL,
     MIN_CONTRAST_DB,
     NO_LIMITS,
     SAME_LEVEL,
@@ -36,9 +33,15 @@ from model.answer.answer import (
     Limits,
     Stream,
     Tones,
-    amplitudes_of,
 )
-from model.answer.promise import share_stroke, with_tones
+from model.answer.answer_levels import (
+    as_quiet_fingers_allow,
+    as_ramps_allow,
+    gains_within,
+    scaled,
+    with_gains,
+)
+from model.answer.modulation import is_served, with_modulation
 from model.answer.stimulus import (
     ANY,
     MIN_LEVEL_DB_SL,
@@ -49,7 +52,7 @@ from model.answer.stimulus import (
     together,
 )
 from model.answer.tone_search import choose_tones
-from model.arrays import NEARLY, FloatArray, Point, best_by, best_of
+from model.arrays import NEARLY, Point, best_by
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
@@ -64,13 +67,6 @@ With more, 34 of 36 sets with two quiet fingers ended with one vibration for all
 
 CONTENTS_A_STEP = 3
 """One in this many vibrations (at least one) is merged before the rest is evaluated again."""
-
-_SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
-_ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # all three, above the carrier
-_NEAR = 2  # carriers tried on each side of the steady one, in table frequencies
-_SAME = 0.5  # Hz; largest asymmetry of the side bands about the carrier
-_ROUNDING_DB = 1e-3  # difference of promises that counts as equal
-_SILENT_DB = -60.0  # gain at which a content is not felt
 
 
 def answer(
@@ -377,15 +373,15 @@ class _Search:
             attempt = tried[-1]
             if len(served) + 1 < len(order):
                 chosen = {*served, content}
-                contents = tuple(each for each in plan.contents if each in chosen)
+                contents = tuple(filter(chosen.__contains__, plan.contents))
                 attempt = self._measure(replace(plan, contents=contents))
             with_content[content] = attempt
             if not self._fails(attempt):
                 result = attempt
                 served.append(content)
             elif content == order[0] and not _is_out_of_bounds(attempt):
-                allowed = [each for each in (*tried, attempt) if not _is_out_of_bounds(each)]
-                result = best_by(allowed, worst_of)
+                within_bounds = [*filterfalse(_is_out_of_bounds, (*tried, attempt))]
+                result = best_by(within_bounds, worst_of)
                 break
         return self._with_held_back(result, with_content)
 
@@ -542,10 +538,10 @@ class _Search:
         )
 
 
-def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
+def _softer(result: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
     """Return the fingers of an answer, at the frequencies of their layers, with gains [dB]."""
-    softer = list(found.asked)
-    for layer, gain in zip(found.layers, gains_db, strict=True):
+    softer = list(result.asked)
+    for layer, gain in zip(result.layers, gains_db, strict=True):
         for number in layer.fingers:
             finger = softer[number]
             if finger.stimulus is not None and layer.frequency is not None:
@@ -556,252 +552,16 @@ def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
     return tuple(softer)
 
 
-def _is_out_of_bounds(found: Answer) -> bool:
+def _is_out_of_bounds(result: Answer) -> bool:
     """Return whether a finger has less contrast, or more of others' contents, than it allows."""
-    is_one_of_many = len(found.contents.streams) > 1  # a single content cannot give way
-    return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
+    is_one_of_many = len(result.contents.streams) > 1  # a single content cannot give way
+    return (is_one_of_many and result.lacks_contrast) or bool(result.disturbed)
 
 
-def worst_of(found: Answer) -> float:
+def worst_of(result: Answer) -> float:
     """Return the promised contrast [dB] of the worst finger, infinite for a single finger."""
-    return math.inf if found.promised_worst_db is None else found.promised_worst_db
-
-
-def is_served(found: Answer, steady: Answer) -> bool:
-    """Return whether all fingers meet their requirements, and have at least 6 dB unless they had
-    less."""
-    worst, before = found.promised_worst_db, steady.promised_worst_db
-    if (
-        worst is not None
-        and before is not None
-        and worst < min(MIN_CONTRAST_DB, before - _ROUNDING_DB)
-    ):
-        return False
-    return not (found.lacks_contrast or found.disturbed)
+    return math.inf if result.promised_worst_db is None else result.promised_worst_db
 
 
 def _at(finger: Finger) -> str:
     return f"({finger.at[0]:g}, {finger.at[1]:g}) m"
-
-
-def with_modulation(
-    table: LocalizationTable,
-    found: Answer,
-    *,
-    playable: tuple[float, float],
-) -> Answer:
-    """Modulate an answer as its fingers request, if all fingers remain served.
-
-    playable: lowest and highest frequency [Hz] of side bands. These are equally far below and above
-    the carrier, at the table's frequencies nearest to the modulation, APART_HZ from all tones of
-    other contents, and not among the avoided frequencies. A shared content is steady. Levels are
-    lowered to fit the stroke.
-    """
-    lowest = max(playable[0], table.frequencies[0])
-    highest = min(playable[1], table.frequencies[-1])
-    for number, stream in enumerate(found.contents.streams):
-        stimulus = found.asked[stream.targets[0]].stimulus
-        modulation = None if stimulus is None else stimulus.modulation_hz
-        if stimulus is None or modulation is None or len(stream.targets) > 1:
-            continue
-        owners, rows = np.array(found.tones.owners), np.array(found.tones.rows)
-        others = table.frequencies[rows[owners != number]]
-        steady = int(rows[owners == number][0])
-        candidates = [
-            tones
-            for tones in _carriers(table, steady, modulation)
-            if not {*tones} & {*found.contents.avoided}
-            and _fits(
-                table.frequencies[tones], modulation, stimulus.band_hz, (lowest, highest), others
-            )
-        ]
-        if not candidates:
-            continue
-        modulated = _with_tones_of(table, found, number, candidates)
-        if is_served(modulated, found):
-            found = modulated
-    return found
-
-
-def _with_tones_of(
-    table: LocalizationTable, found: Answer, number: int, candidates: Sequence[Sequence[int]]
-) -> Answer:
-    """Give a content the carrier and side bands with the best contrast, within the stroke."""
-    tones = found.tones
-    owners, rows, gains = np.array(tones.owners), np.array(tones.rows), np.array(tones.gains)
-    tone_at = cache(_alone_at(table, found, number))
-    contrasts = [_contrast_db([tone_at(row) for row in candidate]) for candidate in candidates]
-    best = candidates[best_of(contrasts)]
-    own = [tone_at(row) for row in best]
-    own_gains = _SHARES * 10 ** (-_ALL_DB / 20) * [tone.gains[0] for tone in own]
-    kept = np.flatnonzero(owners != number)
-    modulated = with_tones(
-        table,
-        found,
-        np.append(rows[kept], best),
-        [*(tones.weights[tone] for tone in kept.tolist()), *(tone.weights[0] for tone in own)],
-        np.append(owners[kept], [number] * len(own)),
-        np.append(gains[kept], own_gains),
-    )
-    return _within_stroke(table, modulated)
-
-
-def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:
-    """Yield rows of a carrier near a steady one, and of the side bands nearest to a modulation."""
-    frequencies = table.frequencies
-    for carrier in range(max(steady - _NEAR, 0), min(steady + _NEAR + 1, len(frequencies))):
-        f = frequencies[carrier]
-        above = int(np.argmin(np.abs(frequencies - f - modulation)))
-        yield [carrier, int(np.argmin(np.abs(frequencies - 2 * f + frequencies[above]))), above]
-
-
-def _fits(
-    tones: FloatArray,
-    modulation: float,
-    band: tuple[float, float],
-    limits: tuple[float, float],
-    taken: FloatArray,
-) -> bool:
-    """Return whether carrier and side bands [Hz] are symmetric, within limits, and apart from
-    others."""
-    f, below, above = tones
-    gap, reach = above - f, max(above - f, modulation)
-    is_even = gap > 0 and abs(f - below - gap) <= _SAME
-    is_within = band[0] <= f <= band[1] and limits[0] <= f - reach and f + reach <= limits[1]
-    is_apart = all(abs(tone - other) >= APART_HZ for tone in tones for other in taken)
-    return bool(is_even and is_within and is_apart)
-
-
-def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[[int], Tones]:
-    """Return a function that finds a content's tone at a row, with all other fingers quiet."""
-    stream, contents = found.contents.streams[number], found.contents
-    (finger,), course = stream.targets, stream.course
-    level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
-    others = tuple(n for n, each in enumerate(found.asked) if n != finger and not each.is_load)
-    background = None if others else table.background([contents.places[finger]])
-
-    def alone(row: int) -> Tones:
-        one = Stream((finger,), level_db_sl, ((row, row + 1),))
-        asked = replace(contents, streams=(one,), quiet=others, background=background)
-        return choose_tones(table, asked)
-
-    return alone
-
-
-def _contrast_db(tones: Sequence[Tones]) -> float:
-    """Return the promised contrast [dB] of a carrier and its side bands, whose leakage adds up."""
-    own = np.array([each.worst_db for each in tones])
-    leaks = (_SHARES**2 * 10 ** (-own / 10))[np.isfinite(own)]
-    return _ALL_DB - float(decibels(np.sqrt(leaks.sum()))) if len(leaks) else math.inf
-
-
-def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
-    """Lower the contents of an answer until all tones together fit the stroke."""
-    tones, streams = found.tones, found.contents.streams
-    rows, owners, gains = (np.array(each) for each in (tones.rows, tones.owners, tones.gains))
-    drives = np.zeros((len(streams), len(table.eras)))
-    np.add.at(drives, owners, gains[:, None] * np.abs(tones.weights))
-    reached = [min(tones.level_db_sl[finger][1] for finger in each.targets) for each in streams]
-    levels = np.maximum(10 ** (np.array(reached) / 20), 1e-9)  # above 0 for silent contents
-    priorities = [each.priority for each in streams]
-    factors, factor = share_stroke(np.ones(len(streams)), drives, levels, priorities)
-    if factor < 1 - NEARLY:
-        found = with_tones(table, found, rows, tones.weights, owners, gains * factors[owners])
-    least_db = float(decibels(levels * factors / found.contents.levels).min())
-    of_all = 1.0 if least_db > -SAME_LEVEL else 10 ** (least_db / 20)
-    return replace(found, tones=replace(found.tones, stroke_factor=of_all))
-
-
-def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
-    """Set the levels of stimuli with `is_limit` to the highest that the other fingers allow.
-
-    Together they reach at most IMPERCEPTIBLE_DB_SL at quiet fingers, relative to the rig's own
-    thresholds, on 90 % of plates. For fingers with their own vibration, none is raised above that
-    level, but none is lowered either.
-    """
-    streams, tones = found.contents.streams, found.tones
-    limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
-    heard = tones.foreign_db_sl
-    if len(limited) < len(streams):  # level of the limited contents alone
-        alone = np.full(len(streams), _SILENT_DB)
-        alone[limited] = 0.0
-        heard = with_gains(table, found, alone).tones.foreign_db_sl
-    gains_db = np.zeros(len(streams))
-    for number in limited:
-        stream = streams[number]
-        level = min(tones.level_db_sl[finger][0] for finger in stream.targets)
-        highest = IMPERCEPTIBLE_DB_SL - float(decibels(math.sqrt(len(limited))))
-        quiet, others = found.contents.quiet, found.contents.others(number)
-        allowed = highest - max([heard[finger][0] for finger in quiet], default=-math.inf)
-        raised = highest - max([heard[finger][0] for finger in others], default=-math.inf)
-        gains_db[number] = min((stream.limit_db_sl or 0.0) - level, allowed, max(raised, 0.0))
-    return with_gains(table, found, gains_db)
-
-
-def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> Answer:
-    """Lengthen the ramps of short stimuli to respect the amplifiers' slew limit.
-
-    Levels are raised in return, except for stimuli with `is_limit`, whose level other fingers set.
-    """
-    contents, tones, strokes = found.contents, found.tones, table.full_levels
-    if contents.is_shaped or all(stream.duration is None for stream in contents.streams):
-        return found
-    ramp = max([tone / strokes[name] for name, tone in found.amplitudes.items()]) / limits.slew
-    if ramp <= min([layer.ramp for layer in found.layers]):
-        return found
-    longer = replace(found, contents=replace(contents, least_ramp=ramp))
-    rows, owners = np.array(tones.rows, dtype=int), np.array(tones.owners, dtype=int)
-    is_free = all(stream.limit_db_sl is None for stream in contents.streams)
-    gains = None if is_free else np.array(tones.gains)
-    return with_tones(table, longer, rows, tones.weights, owners, gains)
-
-
-def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> FloatArray:
-    """Compute gains [dB] on the layers of an answer that bring them within the amplifiers' limits.
-
-    Limits are shared like the stroke: lower priorities are reduced first, and louder layers first
-    among equal priorities. A layer's power counts by its share of the total.
-    """
-    strokes = table.full_levels
-    each_layer = [amplitudes_of(layer.excitations) for layer in found.layers]
-    amplitudes = np.array([[each[name] for name in strokes] for each in each_layer])
-    levels = amplitudes / [*strokes.values()]
-    norms = np.linalg.norm(levels, axis=1)
-    power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
-    highest = limits.amplitudes or strokes
-    full = amplitudes / [highest[name] for name in strokes]
-    ways = np.array([table.excursion_of(layer.drives) for layer in found.layers])
-    limited = np.column_stack([full, power / math.sqrt(limits.power), ways / limits.excursion])
-    streams = found.contents.streams
-    promised = np.array([found.fingers[each.targets[0]].promised_level_db_sl for each in streams])
-    factors, _ = share_stroke(
-        np.ones(len(streams)),
-        limited.astype(np.complex64),
-        10 ** (promised / 20),
-        [found.asked[each.targets[0]].priority for each in streams],
-    )
-    return np.maximum(decibels(np.maximum(factors, 1e-9)), _SILENT_DB)
-
-
-def with_gains(table: LocalizationTable, found: Answer, gains_db: FloatArray) -> Answer:
-    """Apply a gain [dB] to each layer of an answer, within the stroke."""
-    tones = found.tones
-    gains = 10 ** (gains_db / 20)
-    owners = np.array(tones.owners, dtype=int)
-    by_tone = gains[owners] * tones.gains
-    stroke = float((by_tone[:, None] * np.abs(np.array(tones.weights))).sum(axis=0).max(initial=0))
-    every = np.array(tones.rows, dtype=int), tones.weights, owners, by_tone / max(stroke, 1.0)
-    return with_tones(table, found, *every)
-
-
-def scaled(found: Answer, gain_db: float) -> Answer:
-    """Apply one gain [dB] to a whole answer; contrasts do not change."""
-    tones, factor = found.tones, 10 ** (gain_db / 20)
-    louder = replace(
-        tones,
-        gains=[factor * each for each in tones.gains],
-        level_db_sl=[[each + gain_db for each in levels] for levels in tones.level_db_sl],
-        foreign_db_sl=[[each + gain_db for each in by_set] for by_set in tones.foreign_db_sl],
-        stroke_factor=tones.stroke_factor * factor,
-    )
-    return replace(found, tones=louder)

@@ -15,7 +15,8 @@ import numpy as np
 
 from controller.play import joint_answers, planner
 from model.answer.answer import NO_LIMITS, Answer, Contents, Layer, Limits, Sensation, Stream, Tones
-from model.answer.plan import answer, prepare_answers, query, scaled
+from model.answer.answer_levels import scaled
+from model.answer.plan import answer, prepare_answers, query
 from model.answer.stimulus import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus, together
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors

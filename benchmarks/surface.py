@@ -189,7 +189,7 @@ def _through_the_wire(sets: int) -> tuple[list[str], bool]:
         for name, own in (("", {}), (", each mode sampled", OF_MODES)):
             file = Path(folder) / f"glass{len(name)}.yaml"
             file.write_text(f"{GLASS.read_text('utf-8')}uncertainty: {own}\n", "utf-8")
-            case = Case(f"three contents{name}", str(file.with_suffix("")), contents=3)
+            case = Case(f"three vibrations{name}", str(file.with_suffix("")), contents=3)
             timing = Timing(case.table)
             found[case] = [on_plate(case, timing, seed) for seed in range(sets)]
         rows = as_markdown(found)

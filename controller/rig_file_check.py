@@ -155,7 +155,7 @@ def _uncertainty_note(rig: Rig, key: str, *, cause: str, remedy: str) -> Iterato
     """Yield the contrast that remains with one uncertainty of a rig."""
     with contextlib.suppress(InputError):  # the plate is too small for two fingers
         cost = uncertainty_cost(rig, key)
-        yield f"{cause} two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; {remedy}"
+        yield f"{cause} two vibrations keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; {remedy}"
 
 
 def _span_notes(rig: Rig) -> Iterator[str]:
@@ -179,7 +179,7 @@ def _span_notes(rig: Rig) -> Iterator[str]:
         contrast_db = clock_cost(rig, exact_clocks).exact_db
         corner_db = clock_cost(corner_rig, exact_clocks).exact_db
         yield (
-            f"eras: they span {percent(share)} of the plate; two contents are promised "
+            f"eras: they span {percent(share)} of the plate; two vibrations are promised "
             f"{contrast_db:.1f} dB, with ERAs spread to its corners {corner_db:.1f} dB: check `at` "
             "of each after a change of plate.length or plate.width"
         )
@@ -211,7 +211,7 @@ def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict
             error_us[name] = round(1e6 * error, 1)
     summary = (
         f"{len(rig.eras)} ERAs on {len(errors)} amplifiers over {arrangement.lines}: clocks held "
-        f"together to {1e6 * largest_error:.0f} us; two contents keep {cost.kept_db:.1f} of "
+        f"together to {1e6 * largest_error:.0f} us; two vibrations keep {cost.kept_db:.1f} of "
         f"{cost.exact_db:.1f} dB"
     )
     data = {
@@ -227,7 +227,7 @@ def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict
     warnings = [summary]
     for name in unsteered:
         warnings.append(
-            f"amplifier {name} has no clock that can be steered: its ERAs play contents of their "
+            f"amplifier {name} has no clock that can be steered: its ERAs play vibrations of their "
             "own"
         )
     return "", warnings, {"clocks": data}

@@ -163,7 +163,7 @@ class Case:
         if self.is_plain:
             words.append("plain asyncio")
         if self.is_two:
-            words.append("two with their own contents")
+            words.append("two with their own vibrations")
         if self.is_loaded:
             words.append("loaded")
         if self.is_planted:

@@ -117,7 +117,7 @@ _THREE = (*_TWO, (230.0, 320.0))
 def _drifting(lines: str, kind: str, *, is_one_bus: bool) -> Case:
     """Two contents on three amplifiers whose clocks drift, while fingers rest."""
     return Case(
-        f"two contents at rest, {lines}",
+        f"two vibrations at rest, {lines}",
         "car_display",
         is_identified=True,
         line=kind,
@@ -135,28 +135,28 @@ def _clicks(name: str, clicks: tuple[int, ...], *, contents: int, quiet: int = 0
 
 
 CASES = (
-    Case("one content, two quiet fingers", contents=1, quiet=2),
-    Case("two contents", events=(*_EVENTS, MOVES)),
-    Case("two contents", is_identified=True, events=(*_EVENTS, MOVES)),
-    Case("three contents", "eight_eras", 3),
-    Case("three contents", "eight_eras", 3, is_identified=True),
-    Case("four contents", "car_display", 4, is_identified=True, events=_EVENTS),
-    Case("two contents, bands given", bands=_TWO),
-    Case("two contents, bands in any order", bands=_TWO, may_swap=True),
-    Case("three contents, bands given", contents=3, bands=_THREE),
-    Case("three contents, bands in any order", contents=3, bands=_THREE, may_swap=True),
-    Case("two contents, bands given", "car_display", bands=_TWO),
-    Case("three contents, bands given", "car_display", contents=3, bands=_THREE),
-    Case("texture of 20 Hz next to a steady content", is_identified=True, modulation_hz=20.0),
+    Case("one vibration, two quiet fingers", contents=1, quiet=2),
+    Case("two vibrations", events=(*_EVENTS, MOVES)),
+    Case("two vibrations", is_identified=True, events=(*_EVENTS, MOVES)),
+    Case("three vibrations", "eight_eras", 3),
+    Case("three vibrations", "eight_eras", 3, is_identified=True),
+    Case("four vibrations", "car_display", 4, is_identified=True, events=_EVENTS),
+    Case("two vibrations, bands given", bands=_TWO),
+    Case("two vibrations, bands in any order", bands=_TWO, may_swap=True),
+    Case("three vibrations, bands given", contents=3, bands=_THREE),
+    Case("three vibrations, bands in any order", contents=3, bands=_THREE, may_swap=True),
+    Case("two vibrations, bands given", "car_display", bands=_TWO),
+    Case("three vibrations, bands given", "car_display", contents=3, bands=_THREE),
+    Case("texture of 20 Hz next to a steady vibration", is_identified=True, modulation_hz=20.0),
     _drifting("one bus, USB high speed", "usb-high-speed", is_one_bus=True),
     _drifting("one bus, USB full speed", "usb-full-speed", is_one_bus=True),
     _drifting("a line each, USB high speed", "usb-high-speed", is_one_bus=False),
     _drifting("a line each, USB full speed", "usb-full-speed", is_one_bus=False),
     *_clicks("alone", (0,), contents=0, quiet=2),
-    *_clicks("next to another content", (1,), contents=1, quiet=1),
+    *_clicks("next to another vibration", (1,), contents=1, quiet=1),
     *_clicks("on its own buzz, next to another", (0, 1), contents=2),
     *(
-        Case("two contents, one moves", rig, is_identified=is_identified, events=(MOVES,))
+        Case("two vibrations, one moves", rig, is_identified=is_identified, events=(MOVES,))
         for rig, is_identified in RIGS
     ),
 )

@@ -197,21 +197,21 @@ class ContactStatus(ApiMessage):
     )
     verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
         None,
-        description="how a target feels its content. own: separately; mixed: together with other "
-        "contents (promised contrast below 12 dB, or others are felt during its "
-        "pauses); shared: it feels another finger's content instead; held back: not "
+        description="how a target feels its vibration. own: separately; mixed: together with other "
+        "vibrations (promised contrast below 12 dB, or others are felt during its "
+        "pauses); shared: it feels another finger's vibration instead; held back: not "
         "at all",
     )
     frequency_hz: float | None = Field(
         None,
-        description="requested frequency of its content, before rounding; null if the content has "
+        description="requested frequency of its vibration, before rounding; null if the vibration has "
         "several frequencies",
     )
     foreign_level_db_sl: float | None = Field(
         None,
-        description="crosstalk level of others' contents here, not exceeded on 90 % of "
+        description="crosstalk level of others' vibrations here, not exceeded on 90 % of "
         "plates, relative to the most sensitive published thresholds (not comparable with "
-        "level_db_sl); null if there are no other contents",
+        "level_db_sl); null if there are no other vibrations",
     )
     rig_foreign_level_db_sl: float | None = Field(
         None,
@@ -219,14 +219,14 @@ class ContactStatus(ApiMessage):
     )
     is_foreign_felt: bool = Field(
         False,
-        description="whether other contents can be felt here (foreign_level_db_sl above 0); "
+        description="whether other vibrations can be felt here (foreign_level_db_sl above 0); "
         "with verdict own they are at least 12 dB weaker",
     )
     leak_db_sl: float | None = Field(
         None,
         description="crosstalk level at the finger's current position on the nominal plate, "
         "relative to the rig's threshold set; can exceed the promise while the "
-        "finger moves; sent only in the status; null if there are no other contents",
+        "finger moves; sent only in the status; null if there are no other vibrations",
     )
     held_back: str | None = Field(
         None,
@@ -252,11 +252,11 @@ class PatternFields(ApiMessage):
 
     contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
     drive: dict[str, PlayedTone] = Field(
-        description="tones of the newest content by ERA; silent ERAs are omitted"
+        description="tones of the newest vibration by ERA; silent ERAs are omitted"
     )
     layers: dict[str, dict[str, PlayedTone]] = Field(
         default_factory=dict,
-        description="tones of each content by layer, then by ERA, in the format of `drive`; an ERA "
+        description="tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA "
         "plays "
         "the sum of its layers",
     )

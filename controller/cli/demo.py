@@ -275,7 +275,7 @@ def _notes(row: "TouchRow") -> str:
         note = "  still ringing"
     for finger in row.fingers:
         if finger.at_m == row.targets_m[0]:
-            note += f"  {finger.verdict}, of {counted(len(row.contents), 'content')}"
+            note += f"  {finger.verdict}, of {counted(len(row.contents), 'vibration')}"
     return note
 
 

@@ -68,7 +68,7 @@ from registry.service_manager import ServiceManager
 from registry.virtual_time import VirtualTimeLoop
 
 MIN_ERAS_FOR_THREE = 8
-"""Number of ERAs from which three people have contents of their own, else two."""
+"""Number of ERAs from which three people have their own vibrations, else two."""
 
 SILENT_SHARE = 0.2
 """Share of the plate's length between the strips of several people."""
@@ -452,7 +452,7 @@ def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path)
     if measured:
         figures["contents"] = _several_contents_figure(table, measured)
     elif with_several:
-        omitted.append("no contents.png: no touch with several contents was measured")
+        omitted.append("no contents.png: no touch with several vibrations was measured")
     else:
         omitted.append("no contents.png: no two fingers had their own vibrations simultaneously")
     folder.mkdir(parents=True, exist_ok=True)

@@ -35,7 +35,7 @@ from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text
 
-_USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
+_USED_UP = "the vibrations of other fingers use the whole stroke; lift a finger"
 
 _logger = logging.getLogger(__name__)
 

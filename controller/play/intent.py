@@ -220,7 +220,7 @@ class ContentKey(NamedTuple):
     content."""
 
 
-BEING_CHOSEN = "its content is being selected; wait a moment"
+BEING_CHOSEN = "its vibration is being chosen; wait a moment"
 
 
 def own_level_db_sl(sensation: Sensation) -> float:
@@ -682,7 +682,7 @@ def _power_db(power: float) -> float:
 
 def no_layer_free(count: int) -> str:
     """Return why a content is held back when all layers of the amplifiers are in use."""
-    return f"no layer is free: the amplifiers play {count} simultaneous contents; lift a finger"
+    return f"no layer is free: the amplifiers play {count} simultaneous vibrations; lift a finger"
 
 
 def not_served(contact: Contact, reason: str) -> FingerSensation:

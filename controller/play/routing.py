@@ -408,7 +408,7 @@ class CountedClocks:
                     _logger.log(
                         level,
                         "amplifier %s: its clock is not held to the others', so its ERAs play "
-                        "contents of their own; if that lasts, see its clock_error in era amp "
+                        "vibrations of their own; if that lasts, see its clock_error in era amp "
                         "status",
                         name,
                     )

@@ -104,9 +104,9 @@ export interface StatusResult {
   remedy: string | null;
   /** in order of arrival, newest last */
   contacts: Array<ContactStatus>;
-  /** tones of the newest content by ERA; silent ERAs are omitted */
+  /** tones of the newest vibration by ERA; silent ERAs are omitted */
   drive: Record<string, PlayedTone>;
-  /** tones of each content by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
+  /** tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
   layers?: Record<string, Record<string, PlayedTone>>;
   /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
@@ -306,9 +306,9 @@ export interface ContactsEvent {
 export interface PatternEvent {
   /** in order of arrival, newest last */
   contacts: Array<ContactStatus>;
-  /** tones of the newest content by ERA; silent ERAs are omitted */
+  /** tones of the newest vibration by ERA; silent ERAs are omitted */
   drive: Record<string, PlayedTone>;
-  /** tones of each content by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
+  /** tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
   layers?: Record<string, Record<string, PlayedTone>>;
   /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
   promised_contrast_db?: number | null;
@@ -410,17 +410,17 @@ export interface ContactStatus {
   effect?: string | null;
   /** the effect that the finger feels: its own, or another finger's */
   feels?: string | null;
-  /** how a target feels its content. own: separately; mixed: together with other contents (promised contrast below 12 dB, or others are felt during its pauses); shared: it feels another finger's content instead; held back: not at all */
+  /** how a target feels its vibration. own: separately; mixed: together with other vibrations (promised contrast below 12 dB, or others are felt during its pauses); shared: it feels another finger's vibration instead; held back: not at all */
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
-  /** requested frequency of its content, before rounding; null if the content has several frequencies */
+  /** requested frequency of its vibration, before rounding; null if the vibration has several frequencies */
   frequency_hz?: number | null;
-  /** crosstalk level of others' contents here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); null if there are no other contents */
+  /** crosstalk level of others' vibrations here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); null if there are no other vibrations */
   foreign_level_db_sl?: number | null;
   /** the same level relative to the rig's threshold set, like level_db_sl */
   rig_foreign_level_db_sl?: number | null;
-  /** whether other contents can be felt here (foreign_level_db_sl above 0); with verdict own they are at least 12 dB weaker */
+  /** whether other vibrations can be felt here (foreign_level_db_sl above 0); with verdict own they are at least 12 dB weaker */
   is_foreign_felt?: boolean;
-  /** crosstalk level at the finger's current position on the nominal plate, relative to the rig's threshold set; can exceed the promise while the finger moves; sent only in the status; null if there are no other contents */
+  /** crosstalk level at the finger's current position on the nominal plate, relative to the rig's threshold set; can exceed the promise while the finger moves; sent only in the status; null if there are no other vibrations */
   leak_db_sl?: number | null;
   /** why its own effect, or a click over its continuous effect, is not played; null if it is */
   held_back?: string | null;

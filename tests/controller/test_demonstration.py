@@ -182,7 +182,7 @@ LINES = """\
   4.0    5.0,  5.0       1  SW SE 50 Hz, NE 120 Hz    8.0    9.0    20.0   19.0     9.6\
   still ringing
  12.0   10.0, 10.0       1  SW SE 50 Hz, NE 120 Hz   12.0   14.0    20.0   19.0     9.6\
-  own, of 2 contents
+  own, of 2 vibrations
 7 touches; with other fingers on the plate, 2 of 3 (67%) had at least the promised contrast
 """
 

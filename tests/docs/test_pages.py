@@ -237,7 +237,7 @@ def test_readme_shows_what_the_demonstration_prints(
     ((command, shown),) = re.findall(
         r"^    \$ \.venv/bin/era (demo .*)\n((?:    .*\n)+)", readme, re.MULTILINE
     )
-    assert shown.count("of 3 contents") == 3
+    assert shown.count("of 3 vibrations") == 3
     monkeypatch.chdir(ROOT)
     assert run_era([*command.split(), "--out", str(tmp_path)]) == 0
     what = difference(textwrap.dedent(shown), capsys.readouterr().out)

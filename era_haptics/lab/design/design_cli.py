@@ -71,7 +71,7 @@ def design(
     contents: Annotated[
         int,
         typer.Option(
-            min=1, max=MAX_CONTENTS, help="Number of simultaneous contents, one finger each."
+            min=1, max=MAX_CONTENTS, help="Number of simultaneous vibrations, one per finger."
         ),
     ] = 1,
     contacts: ContactsOption = None,
@@ -232,7 +232,7 @@ def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
             f"{era['static_load_n']:8.2f}"
         )
     if result["contents"] > 1:
-        yield f"{result['contents']} simultaneous contents, contrast of the worst finger:"
+        yield f"{result['contents']} simultaneous vibrations, contrast of the worst finger:"
     for title, key in (("this layout", "contrast_db"), (own, "own_contrast_db")):
         if result[key] is not None:
             medians = " / ".join(

@@ -634,7 +634,7 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(recorder: Any) -
     selection = Selector(Chooser(recorder)).select((at(1, 0.1), at(2, 0.2)), intent, full)
     assert [each.contact.key.id for each in selection.contents] == [1]
     (held,) = selection.unserved
-    assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
+    assert held.held_back == "the vibrations of other fingers use the whole stroke; lift a finger"
 
 
 @pytest.mark.parametrize(("since", "left"), [(0.0, 0.6e-6), (0.02, 0.6e-6), (0.5, 1e-6)])

@@ -86,7 +86,7 @@ def test_config_check_tells_what_clocks_cost(
     clocks = found["clocks"]
     assert clocks["error_us"] == {"a": USB_US, "b": error_us}
     assert clocks["kept_contrast_db"] < clocks["exact_contrast_db"]
-    assert len([each for each in found["warnings"] if "contents" in each]) == warnings
+    assert len([each for each in found["warnings"] if "vibrations" in each]) == warnings
 
 
 def test_tolerance_costs_name_the_uncertain_keys_and_grow_with_them() -> None:

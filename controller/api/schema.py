@@ -204,7 +204,7 @@ class ContactStatus(ApiMessage):
     )
     frequency_hz: float | None = Field(
         None,
-        description="requested frequency of its vibration, before rounding; null if the vibration has "
+        description="requested frequency of its vibration, before rounding; null if it has "
         "several frequencies",
     )
     foreign_level_db_sl: float | None = Field(
@@ -256,9 +256,8 @@ class PatternFields(ApiMessage):
     )
     layers: dict[str, dict[str, PlayedTone]] = Field(
         default_factory=dict,
-        description="tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA "
-        "plays "
-        "the sum of its layers",
+        description="tones of each vibration by layer, then by ERA, in the format of `drive`; "
+        "an ERA plays the sum of its layers",
     )
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     predicted_contrast_db: float | None = Field(None, description="the same on the nominal plate")

@@ -412,7 +412,7 @@ export interface ContactStatus {
   feels?: string | null;
   /** how a target feels its vibration. own: separately; mixed: together with other vibrations (promised contrast below 12 dB, or others are felt during its pauses); shared: it feels another finger's vibration instead; held back: not at all */
   verdict?: "own" | "mixed" | "shared" | "held back" | null;
-  /** requested frequency of its vibration, before rounding; null if the vibration has several frequencies */
+  /** requested frequency of its vibration, before rounding; null if it has several frequencies */
   frequency_hz?: number | null;
   /** crosstalk level of others' vibrations here, not exceeded on 90 % of plates, relative to the most sensitive published thresholds (not comparable with level_db_sl); null if there are no other vibrations */
   foreign_level_db_sl?: number | null;

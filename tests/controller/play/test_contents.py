@@ -246,7 +246,7 @@ def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
     both = HapticIntent((lasting, click))
     (held_back,) = selector.select(CONTACTS, both, hardly, now=0.01).unserved
     assert held_back.contact == CONTACTS[0]
-    assert "contents of other fingers" in str(held_back.held_back)
+    assert "vibrations of other fingers" in str(held_back.held_back)
     after = HapticIntent((lasting,))
     found = selector.select(CONTACTS, after, hardly, now=selector.due)
     assert (found.unserved, len(found.contents)) == ((), 1)

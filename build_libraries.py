@@ -54,8 +54,7 @@ class Library:
 
 def wheel_libraries() -> list[Library]:
     """Return the libraries of a wheel, with the kernels for all processors of this platform."""
-    kernels = [kernel_library(version) for version in versions()]
-    return kernels + _posix_libraries()
+    return [*map(kernel_library, versions()), *_posix_libraries()]
 
 
 def tree_libraries() -> list[Library]:
@@ -76,7 +75,9 @@ def kernel_library(version: Version) -> Library:
 
 def _posix_libraries() -> list[Library]:
     """Return the engine of the software amplifier where there are POSIX threads."""
-    return [engine_library()] if os.name == "posix" else []
+    if os.name != "posix":
+        return []
+    return [engine_library()]
 
 
 def engine_library() -> Library:
@@ -125,7 +126,7 @@ def _compiler() -> list[str]:
 def compile_library(library: Library, path: Path) -> None:
     """Compile a library to a file; raises BuildError."""
     command = [*_compiler(), *library.flags, "-fPIC", "-shared", "-o", str(path)]
-    command += [str(source) for source in library.sources]
+    command += map(str, library.sources)
     command.append("-lm")
     done = subprocess.run(  # noqa: S603  the user's compiler
         command, capture_output=True, encoding="utf-8", errors="replace", check=False

@@ -118,6 +118,7 @@ def test_entry_points_lead_into_the_wheel(wheel: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.needs("cc")
 def test_sdist_makes_the_same_wheel(platform_wheel: Path, sdist: Path, tmp_path: Path) -> None:
     """Byte for byte, with the same compiler, so a distribution's build equals the published one."""
     with tarfile.open(sdist) as archive:
@@ -129,6 +130,7 @@ def test_sdist_makes_the_same_wheel(platform_wheel: Path, sdist: Path, tmp_path:
 
 
 @pytest.mark.long
+@pytest.mark.needs("cc")
 def test_wheel_of_a_platform_brings_its_libraries(
     wheel: Path, platform_wheel: Path, tmp_path: Path
 ) -> None:
@@ -162,6 +164,7 @@ def test_wheel_of_a_platform_brings_its_libraries(
 
 
 @pytest.mark.long
+@pytest.mark.needs("cc")
 def test_editable_installation_gets_the_libraries_of_its_processor(tmp_path: Path) -> None:
     """They are in the tree, the wheel has none, and those of other processors are not compiled."""
     tree = tmp_path / "tree"
@@ -178,6 +181,7 @@ def test_editable_installation_gets_the_libraries_of_its_processor(tmp_path: Pat
     assert compiled == {library.file for library in tree_libraries()}
 
 
+@pytest.mark.needs("cc")
 def test_library_is_compiled_if_its_sources_differ_from_those_it_was_compiled_of(
     tmp_path: Path,
 ) -> None:

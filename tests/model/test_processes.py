@@ -264,6 +264,7 @@ def libraries(tmp_path: Path) -> Path:
         (("AVX2", "FMA3"), ("avx2", "plain"), None),
     ],
 )
+@pytest.mark.needs("cc")
 @pytest.mark.skipif(len(versions()) == 1, reason="this architecture has one version of the kernels")
 def test_kernels_are_the_fastest_that_the_processor_can_run(
     features: tuple[str, ...],

@@ -68,7 +68,9 @@ class EdgedFunctions:
 
     def polynomial_count(self, parity: int) -> int:
         """Number of polynomials of a parity; these are its first functions."""
-        return (self.degree - first_degree(parity)) // 2 + 1 if self._has(parity) else 0
+        if not self._has(parity):
+            return 0
+        return (self.degree - first_degree(parity)) // 2 + 1
 
     def count(self, parity: int) -> int:
         """Number of functions of a parity."""
@@ -77,23 +79,22 @@ class EdgedFunctions:
     @cached_property
     def slope_products(self) -> dict[int, FloatArray]:
         """By parity: integrals of f' g over the length, f of the parity, g of the other, (n, m)."""
+        weights = self._weights[:, None]
         return {
-            parity: self._slopes[parity].T @ (self._weights[:, None] * self._values[-parity])
+            parity: self._slopes[parity].T @ (weights * self._values[-parity])
             for parity in (EVEN, ODD)
         }
 
     @cached_property
     def slope_squares(self) -> dict[int, FloatArray]:
         """By parity: integrals of f' g' over the length, both of the parity, (n, n)."""
-        return {
-            parity: slopes.T @ (self._weights[:, None] * slopes)
-            for parity, slopes in self._slopes.items()
-        }
+        weights = self._weights[:, None]
+        return {parity: slopes.T @ (weights * slopes) for parity, slopes in self._slopes.items()}
 
     def polynomial_products(self, values: FloatArray, parity: int) -> FloatArray:
         """Integrals with the polynomials of a parity of functions at `points` (q, m), (n, m)."""
-        own = self._values[parity][:, : self.polynomial_count(parity)]
-        return np.asarray(own.T @ (self._weights[:, None] * values))
+        polynomials = self._values[parity][:, : self.polynomial_count(parity)]
+        return np.asarray(polynomials.T @ (self._weights[:, None] * values))
 
     @property
     def points(self) -> FloatArray:
@@ -106,14 +107,18 @@ class EdgedFunctions:
 
     @cached_property
     def _rule(self) -> tuple[FloatArray, FloatArray]:
+        """Points [m] and weights of the integrals, both (q,)."""
         half = self.length / 2
-        breaks = {piece / decay for decay in self.decays for piece in _PIECES}
-        edges = np.array(sorted({0.0, half, *(each for each in breaks if each < half)}))
-        t, w = leggauss(self.degree + 12)
-        sizes = np.diff(edges)
-        x = (edges[:-1, None] + sizes[:, None] * (1 + t) / 2).ravel()
-        weights = (sizes[:, None] * w / 2).ravel()
-        return np.concatenate([x, self.length - x[::-1]]), np.concatenate([weights, weights[::-1]])
+        edges = {0.0, half}
+        for decay in self.decays:
+            edges.update(piece / decay for piece in _PIECES if piece / decay < half)
+        ascending = np.array(sorted(edges))
+        sizes = np.diff(ascending)[:, None]
+        gauss_points, gauss_weights = leggauss(self.degree + 12)
+        x = (ascending[:-1, None] + sizes * (1 + gauss_points) / 2).ravel()
+        weights = (sizes * gauss_weights / 2).ravel()
+        both_halves = np.concatenate([x, self.length - x[::-1]])
+        return both_halves, np.concatenate([weights, weights[::-1]])
 
     def _has(self, parity: int) -> bool:
         return self.degree >= first_degree(parity)
@@ -129,33 +134,55 @@ class EdgedFunctions:
     @cached_property
     def _functions(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
         """Values and slopes at the points, by parity."""
-        x, weights = self._rule
-        n = np.arange(self.degree + 1)
-        scale = np.sqrt((2 * n + 1) / self.length)
-        t = 2 * x / self.length - 1
+        polynomials, polynomial_slopes = self._polynomials
+        values = dict[int, FloatArray]()
+        slopes = dict[int, FloatArray]()
+        for parity in (EVEN, ODD):
+            of_parity = slice(first_degree(parity), None, 2)
+            values[parity] = polynomials[:, of_parity]
+            slopes[parity] = polynomial_slopes[:, of_parity]
+            if self._has(parity):
+                for decay in self.decays:
+                    values[parity], slopes[parity] = self._with_layer(
+                        values[parity], slopes[parity], decay, parity
+                    )
+        return values, slopes
+
+    @property
+    def _polynomials(self) -> tuple[FloatArray, FloatArray]:
+        """Values and slopes (q, degree + 1) of all polynomials at the points."""
+        degrees = np.arange(self.degree + 1)
+        scale = np.sqrt((2 * degrees + 1) / self.length)
+        t = 2 * self.points / self.length - 1
         values: FloatArray = np.asarray(legvander(t, self.degree), dtype=float)
         slopes = np.zeros_like(values)
-        for each in n[1:]:
-            slopes[:, each] = each * values[:, each - 1] + t * slopes[:, each - 1]
-        values, slopes = values * scale, slopes * scale * (2 / self.length)
-        root = np.sqrt(weights)[:, None]
-        found: tuple[dict[int, FloatArray], dict[int, FloatArray]] = ({}, {})
-        for parity in (EVEN, ODD):
-            own = slice(first_degree(parity), None, 2)
-            value, slope = values[:, own], slopes[:, own]
-            for k in self.decays if self._has(parity) else ():
-                near, far = np.exp(-k * x), np.exp(-k * (self.length - x))
-                layer, rate = near + parity * far, -k * (near - parity * far)
-                size = np.linalg.norm(root[:, 0] * layer)
-                for _ in range(2):
-                    shares = value.T @ (weights * layer)
-                    layer, rate = layer - value @ shares, rate - slope @ shares
-                norm = np.linalg.norm(root[:, 0] * layer)
-                if norm > _NEGLIGIBLE * size:
-                    value = np.column_stack([value, layer / norm])
-                    slope = np.column_stack([slope, rate / norm])
-            found[0][parity], found[1][parity] = value, slope
-        return found
+        for degree in degrees[1:]:  # P_n' = n P_(n-1) + t P_(n-1)'
+            slopes[:, degree] = degree * values[:, degree - 1] + t * slopes[:, degree - 1]
+        return values * scale, slopes * scale * (2 / self.length)
+
+    def _with_layer(
+        self, values: FloatArray, slopes: FloatArray, decay: float, parity: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Add the boundary layers of a decay [1/m], orthogonal to the functions (q, n) so far.
+
+        Unchanged if the functions represent the layers already.
+        """
+        x, weights = self._rule
+        near = np.exp(-decay * x)
+        far = np.exp(-decay * (self.length - x))
+        layer = near + parity * far
+        layer_slope = -decay * (near - parity * far)
+        root_weights = np.sqrt(weights)
+        size = np.linalg.norm(root_weights * layer)
+        for _ in range(2):  # once leaves rounding errors
+            shares = values.T @ (weights * layer)
+            layer = layer - values @ shares
+            layer_slope = layer_slope - slopes @ shares
+        norm = np.linalg.norm(root_weights * layer)
+        if norm <= _NEGLIGIBLE * size:
+            return values, slopes
+        with_layer = np.column_stack([values, layer / norm])
+        return with_layer, np.column_stack([slopes, layer_slope / norm])
 
 
 def first_degree(parity: int) -> int:
@@ -170,13 +197,17 @@ def deflections_by_class(
 
     At footprints (p, 3) their mean.
     """
-    basis = mean_over(
-        partial(_deflections, sides, degrees), points, length=sides[0], width=sides[1]
-    )
-    counts = [[(degree - first_degree(a)) // 2 + 1 for a in (EVEN, ODD)] for degree in degrees]
-    of = {EVEN: 0, ODD: 1}
-    ends = np.cumsum([counts[0][of[a]] * counts[1][of[b]] for a, b in CLASSES[:-1]])
-    return np.split(basis, ends, axis=1)
+    length, width = sides
+    evaluate = partial(_deflections, sides, degrees)
+    basis = mean_over(evaluate, points, length=length, width=width)
+    sizes = list[int]()
+    for parities in CLASSES:
+        counts = [
+            (degree - first_degree(parity)) // 2 + 1
+            for degree, parity in zip(degrees, parities, strict=True)
+        ]
+        sizes.append(math.prod(counts))
+    return np.split(basis, np.cumsum(sizes[:-1]), axis=1)
 
 
 def _deflections(
@@ -184,11 +215,13 @@ def _deflections(
 ) -> FloatArray:
     """Products of polynomials of x and y at points (p, 2), class after class, (p, n)."""
     along_x, along_y = map(_polynomials, points.T, sides, degrees)
-    products = []
-    for a, b in CLASSES:
-        of_x, of_y = along_x[:, first_degree(a) :: 2], along_y[:, first_degree(b) :: 2]
+    products = list[FloatArray]()
+    for x_parity, y_parity in CLASSES:
+        of_x = along_x[:, first_degree(x_parity) :: 2]
+        of_y = along_y[:, first_degree(y_parity) :: 2]
         count = of_x.shape[1] * of_y.shape[1]
-        products.append((of_x[:, :, None] * of_y[:, None]).reshape(len(points), count))
+        class_products = of_x[:, :, None] * of_y[:, None]
+        products.append(class_products.reshape(len(points), count))
     return np.hstack(products)
 
 
@@ -205,12 +238,14 @@ def edge_decays(section: CrossSection, along: int) -> tuple[float, ...]:
     twist the layers against each other: twist v'' = slip v over the distance from it. For a
     homogeneous layer k = sqrt(10) / h, for a board times sqrt(G23 / G12) or sqrt(G13 / G12).
     """
-    slip, twist = np.real(section.slip[1 - along]), np.real(section.twist)
+    slip = np.real(section.slip[1 - along])
+    twist = np.real(section.twist)
     squares = linalg.eigh(slip, twist, eigvals_only=True)[1:]
-    decays: list[float] = []
-    for k in np.sqrt(np.maximum(squares, 0)):
-        if k > 0 and (not decays or k > _ALIKE * decays[-1]):
-            decays.append(float(k))
+    decays = list[float]()
+    for decay in np.sqrt(np.maximum(squares, 0)):
+        is_alike = decays and decay <= _ALIKE * decays[-1]
+        if decay > 0 and not is_alike:
+            decays.append(float(decay))
     return tuple(decays[:_MAX_LAYERS])
 
 
@@ -229,36 +264,44 @@ class ClassFunctions:
     @property
     def of_w(self) -> tuple[int, int]:
         """Functions of the deflection along x and y."""
-        a, b = self.parity
-        return self.x.polynomial_count(a), self.y.polynomial_count(b)
+        x_parity, y_parity = self.parity
+        return self.x.polynomial_count(x_parity), self.y.polynomial_count(y_parity)
 
     @property
     def of_x(self) -> tuple[int, int]:
         """Functions of u_x along x and y."""
-        a, b = self.parity
-        return self.x.count(-a), self.y.count(b)
+        x_parity, y_parity = self.parity
+        return self.x.count(-x_parity), self.y.count(y_parity)
 
     @property
     def of_y(self) -> tuple[int, int]:
         """Functions of u_y along x and y."""
-        a, b = self.parity
-        return self.x.count(a), self.y.count(-b)
+        x_parity, y_parity = self.parity
+        return self.x.count(x_parity), self.y.count(-y_parity)
 
     @property
     def deflections(self) -> int:
         """Number of unknowns of the deflection, the first ones."""
-        nx, ny = self.of_w
-        return nx * ny
+        return math.prod(self.of_w)
+
+    @property
+    def along_x(self) -> int:
+        """Number of unknowns of u_x, which follow."""
+        return self.interfaces * math.prod(self.of_x)
+
+    @property
+    def along_y(self) -> int:
+        """Number of unknowns of u_y, the last ones."""
+        return self.interfaces * math.prod(self.of_y)
 
     @property
     def size(self) -> int:
         """Number of all unknowns."""
-        along = self.of_x[0] * self.of_x[1] + self.of_y[0] * self.of_y[1]
-        return self.deflections + self.interfaces * along
+        return self.deflections + self.along_x + self.along_y
 
 
 def class_stiffness(
-    of: ClassFunctions, section: CrossSection, by_side: int | None = None
+    functions: ClassFunctions, section: CrossSection, by_side: int | None = None
 ) -> FloatArray:
     """Stiffness (n, n) [N/m per m² of the orthonormal functions] of a section's real part.
 
@@ -266,42 +309,50 @@ def class_stiffness(
     functions are stretched with the side and displacements along it times its reciprocal s, as
     slopes are. Then each part is a power of s, of u_x,x u_x,x the fourth.
     """
-    x, y = of.x, of.y
-    a, b = of.parity
-    (wx, wy), (xx, xy), (yx, yy) = of.of_w, of.of_x, of.of_y
-    stretch, across, twist, slip = (
-        np.real(each) for each in (section.stretch, section.across, section.twist, section.slip)
-    )
-    lever, shear = np.real(section.lever)[:, None], np.real(section.shear)[:, None, None]
-    w = slice(0, of.deflections)
-    u = slice(w.stop, w.stop + of.interfaces * xx * xy)
-    v = slice(u.stop, of.size)
-    K = np.zeros((of.size, of.size))
+    x = functions.x
+    y = functions.y
+    x_parity, y_parity = functions.parity
+    w_x, w_y = functions.of_w
+    u_x, u_y = functions.of_x
+    v_x, v_y = functions.of_y
+    stretch = np.real(section.stretch)
+    twist = np.real(section.twist)
+    slip = np.real(section.slip)
+    lever = np.real(section.lever)[:, None]
+    shear = np.real(section.shear)[:, None, None]
+    w = slice(0, functions.deflections)
+    u = slice(w.stop, w.stop + functions.along_x)
+    v = slice(u.stop, functions.size)
 
-    def laid(
+    def part(
         matrix: FloatArray, along_x: FloatArray, along_y: FloatArray, *powers: int
     ) -> FloatArray:
         """One part of the energy; powers of s of both sides in it."""
         factor = 1 if by_side is None else -powers[by_side]
         return _product(factor * matrix, _product(along_x, along_y))
 
-    K[w, w] = laid(shear[0], x.slope_squares[a][:wx, :wx], np.eye(wy), 2, 0)
-    K[w, w] += laid(shear[1], np.eye(wx), y.slope_squares[b][:wy, :wy], 0, 2)
-    K[u, u] = (
-        laid(stretch[0], x.slope_squares[-a], np.eye(xy), 4, 0)
-        + laid(twist, np.eye(xx), y.slope_squares[b], 2, 2)
-        + laid(slip[0], np.eye(xx), np.eye(xy), 2, 0)
+    K = np.zeros((functions.size, functions.size))
+    w_slopes_x = x.slope_squares[x_parity][:w_x, :w_x]
+    w_slopes_y = y.slope_squares[y_parity][:w_y, :w_y]
+    K[w, w] = part(shear[0], w_slopes_x, np.eye(w_y), 2, 0)
+    K[w, w] += part(shear[1], np.eye(w_x), w_slopes_y, 0, 2)
+
+    K[u, u] = part(stretch[0], x.slope_squares[-x_parity], np.eye(u_y), 4, 0)
+    K[u, u] += part(twist, np.eye(u_x), y.slope_squares[y_parity], 2, 2)
+    K[u, u] += part(slip[0], np.eye(u_x), np.eye(u_y), 2, 0)
+
+    K[v, v] = part(stretch[1], np.eye(v_x), y.slope_squares[-y_parity], 0, 4)
+    K[v, v] += part(twist, x.slope_squares[x_parity], np.eye(v_y), 2, 2)
+    K[v, v] += part(slip[1], np.eye(v_x), np.eye(v_y), 0, 2)
+
+    K[u, v] = part(
+        np.real(section.across), x.slope_products[-x_parity], y.slope_products[-y_parity].T, 2, 2
     )
-    K[v, v] = (
-        laid(stretch[1], np.eye(yx), y.slope_squares[-b], 0, 4)
-        + laid(twist, x.slope_squares[a], np.eye(yy), 2, 2)
-        + laid(slip[1], np.eye(yx), np.eye(yy), 0, 2)
-    )
-    K[u, v] = laid(across, x.slope_products[-a], y.slope_products[-b].T, 2, 2)
-    K[u, v] += laid(twist, x.slope_products[a].T, y.slope_products[b], 2, 2)
-    K[w, u] = laid(lever[0], x.slope_products[a][:wx], np.eye(wy, xy), 2, 0)
-    K[w, v] = laid(lever[1], np.eye(wx, yx), y.slope_products[b][:wy], 0, 2)
-    K[v, u], K[u, w], K[v, w] = K[u, v].T, K[w, u].T, K[w, v].T
+    K[u, v] += part(twist, x.slope_products[x_parity].T, y.slope_products[y_parity], 2, 2)
+    K[w, u] = part(lever[0], x.slope_products[x_parity][:w_x], np.eye(w_y, u_y), 2, 0)
+    K[w, v] = part(lever[1], np.eye(w_x, v_x), y.slope_products[y_parity][:w_y], 0, 2)
+    for rows, columns in ((u, v), (w, u), (w, v)):
+        K[columns, rows] = K[rows, columns].T
     return K
 
 
@@ -311,33 +362,34 @@ def _product(left: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray((left[:, None, :, None] * right[:, None]).reshape(shape))
 
 
-def along_mass(of: ClassFunctions, mass: FloatArray, forces: FloatArray) -> FloatArray:
+def along_mass(functions: ClassFunctions, mass: FloatArray, forces: FloatArray) -> FloatArray:
     """Mass matrix of the displacements along the plate times columns (m, k): (m, k).
 
     mass: of `interface_mass`.
     """
-    count = of.interfaces * of.of_x[0] * of.of_x[1]
-    parts = (
-        np.tensordot(mass, each.reshape(of.interfaces, -1, each.shape[1]), axes=1).reshape(
-            each.shape
-        )
-        for each in (forces[:count], forces[count:])
-    )
-    return np.vstack([*parts])
+    products = list[FloatArray]()
+    for direction in np.split(forces, [functions.along_x]):
+        by_interface = direction.reshape(functions.interfaces, -1, direction.shape[1])
+        product = np.tensordot(mass, by_interface, axes=1)
+        products.append(product.reshape(direction.shape))
+    return np.vstack(products)
 
 
-def follow(of: ClassFunctions, stiffness: FloatArray, mass: FloatArray, shift: float) -> FloatArray:
+def follow(
+    functions: ClassFunctions, stiffness: FloatArray, mass: FloatArray, shift: float
+) -> FloatArray:
     """Displacements along the plate under unit deflections, (m, deflections), by least energy.
 
     shift [rad²/s²]: times the mass, keeps the rigid motions along the plate at rest.
     """
-    w = of.deflections
-    own = stiffness[w:, w:].copy()
-    count = of.interfaces * of.of_x[0] * of.of_x[1]
-    for part, each in ((slice(0, count), of.of_x), (slice(count, None), of.of_y)):
-        own[part, part] += shift * _product(mass, np.eye(each[0] * each[1]))
-    factor = linalg.cho_factor(own, lower=True, overwrite_a=True, check_finite=False)
-    return -linalg.cho_solve(factor, stiffness[w:, :w], check_finite=False)
+    first = functions.deflections
+    along = stiffness[first:, first:].copy()
+    u = slice(0, functions.along_x)
+    v = slice(functions.along_x, None)
+    along[u, u] += shift * _product(mass, np.eye(math.prod(functions.of_x)))
+    along[v, v] += shift * _product(mass, np.eye(math.prod(functions.of_y)))
+    factor = linalg.cho_factor(along, lower=True, overwrite_a=True, check_finite=False)
+    return -linalg.cho_solve(factor, stiffness[first:, :first], check_finite=False)
 
 
 # Shapes for each degree: at open edges, where the deflection is not zero, they converge slowly.
@@ -355,26 +407,32 @@ class AirMotion:
     inertia: FloatArray
 
 
-def air_motion(of: ClassFunctions, gap: AirGap) -> AirMotion:
+def air_motion(functions: ClassFunctions, gap: AirGap) -> AirMotion:
     """Air of a symmetry class, with twice as many shapes along each side as polynomials.
 
     If nothing varies along y (a strip of infinite width), the air flows only along x.
     """
-    a, b = of.parity
-    along_x, kx = _shapes(of.x.points, of.x.length, of.x.degree, a, closed=gap.closed)
-    along_y, ky = _shapes(of.y.points, of.y.length, of.y.degree, b, closed=gap.closed)
+    x = functions.x
+    y = functions.y
+    x_parity, y_parity = functions.parity
+    shapes_x, wavenumbers_x = _shapes(x.points, x.length, x.degree, x_parity, closed=gap.closed)
+    shapes_y, wavenumbers_y = _shapes(y.points, y.length, y.degree, y_parity, closed=gap.closed)
     coupling = np.kron(
-        of.x.polynomial_products(along_x, a).T, of.y.polynomial_products(along_y, b).T
+        x.polynomial_products(shapes_x, x_parity).T, y.polynomial_products(shapes_y, y_parity).T
     )
-    k = np.hypot(kx[:, None], ky).ravel()
-    flows = k > 0
-    m, n = coupling.shape[1], int(flows.sum())
-    stiffness = np.zeros((m + n, m + n))
-    stiffness[:m, :m] = coupling.T @ coupling / gap.depth
-    stiffness[m:, :m] = -k[flows, None] * coupling[flows]
-    stiffness[:m, m:] = stiffness[m:, :m].T
-    stiffness[m:, m:] = np.diag(gap.depth * k[flows] ** 2)
-    inertia = np.concatenate([np.zeros(m), np.full(n, gap.depth)])
+    wavenumbers = np.hypot(wavenumbers_x[:, None], wavenumbers_y).ravel()
+    flows = wavenumbers > 0
+    flow_wavenumbers = wavenumbers[flows]
+    function_count = coupling.shape[1]
+    flow_count = int(flows.sum())
+    w = slice(0, function_count)
+    a = slice(function_count, function_count + flow_count)
+    stiffness = np.zeros((a.stop, a.stop))
+    stiffness[w, w] = coupling.T @ coupling / gap.depth
+    stiffness[a, w] = -flow_wavenumbers[:, None] * coupling[flows]
+    stiffness[w, a] = stiffness[a, w].T
+    stiffness[a, a] = np.diag(gap.depth * flow_wavenumbers**2)
+    inertia = np.concatenate([np.zeros(function_count), np.full(flow_count, gap.depth)])
     return AirMotion(stiffness, inertia)
 
 
@@ -385,10 +443,10 @@ def _shapes(
     if not degree:
         return np.full((len(x), 1), 1 / math.sqrt(length)), np.zeros(1)
     if closed:
-        number = np.arange((1 - parity) // 2, _PER_DEGREE * degree + 1, 2)
-        shapes = np.cos(np.pi / length * np.multiply.outer(x, number))
+        half_waves = np.arange((1 - parity) // 2, _PER_DEGREE * degree + 1, 2)
+        shapes = np.cos(np.pi / length * np.multiply.outer(x, half_waves))
     else:
-        number = np.arange((3 - parity) // 2, _PER_DEGREE * degree + 2, 2)
-        shapes = np.sin(np.pi / length * np.multiply.outer(x, number))
-    norms = np.where(number > 0, math.sqrt(2 / length), math.sqrt(1 / length))
-    return np.asarray(shapes * norms), np.asarray(np.pi / length * number)
+        half_waves = np.arange((3 - parity) // 2, _PER_DEGREE * degree + 2, 2)
+        shapes = np.sin(np.pi / length * np.multiply.outer(x, half_waves))
+    norms = np.where(half_waves > 0, math.sqrt(2 / length), math.sqrt(1 / length))
+    return np.asarray(shapes * norms), np.asarray(np.pi / length * half_waves)

@@ -271,7 +271,7 @@ async def _identified(
 ) -> Mapping[str, StopOutcome]:
     """Await a stop while identifying amplifiers: unknown amplifiers confirm nothing."""
     for amplifier in amplifiers:
-        amplifier.forget_capabilities()
+        amplifier.forget_identification()
     requests = [amplifier.identify(timeout=REPLY_TIMEOUT) for amplifier in amplifiers]
     identifying = asyncio.gather(*requests, return_exceptions=True)
     try:

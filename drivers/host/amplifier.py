@@ -155,10 +155,15 @@ class Amplifier:
     motion of a stiff source, None for either.
     """
 
+    is_identified: bool = False
+    """Whether it is known to be the expected amplifier, with these capabilities.
+
+    No status confirms silence before: it may be of another amplifier, or lack channels.
+    """
     identity: Values
-    """Values of its identity record; empty until identified."""
+    """Values of its identity record, as read last; empty before."""
     capabilities: Values
-    """Values of its capabilities record; empty until identified, or if several reply."""
+    """Values of its capabilities record, as read last; empty before."""
     exchange_time: Callable[[str], float]
     """Return how long the longest request with a name and its reply take on the wire [s]."""
     counts: LinkStatistics
@@ -272,7 +277,7 @@ class Amplifier:
     def _exchange_time(self, name: str) -> float:
         """Return how long the longest request with this name and its reply take on the wire [s]."""
         channels, layers = WIDEST
-        if self.capabilities:
+        if self.is_identified:
             channels = self.capabilities["channels"]
             layers = self.capabilities["layers"]
         words = reply_words(name, channels, layers)
@@ -349,7 +354,7 @@ class Amplifier:
             delay += 2 * words / PART_WORDS * set_time
         admitted = self.ledger.admit(layers, moment, delay=delay + valid_for)
         stream = pack_layers(admitted)
-        if not self.capabilities and is_vibrating(*admitted):
+        if not self.is_identified and is_vibrating(*admitted):
             raise CommandRefused(f"amplifier {self.name} must be identified first; open it again")
         max_words = self.ledger.capabilities["set_words"]
         if len(stream) > max_words:
@@ -601,12 +606,17 @@ class Amplifier:
         if math.isnan(ramp):
             return _RAMP.to_wire(STOP_RAMP)
         wire_ramp = _RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high))
-        return min(wire_ramp, int(self.capabilities.get("ramp_max", _RAMP.maximum)))
+        if not self.is_identified:
+            return wire_ramp
+        ramp_max: int = self.capabilities["ramp_max"]
+        return min(wire_ramp, ramp_max)
 
     def is_silent(self, status: Values) -> bool:
         """Whether a status shows the levels of all channels, all zero."""
-        channels = self.capabilities.get("channels")
-        return channels == len(status["levels"]) and not any(status["levels"])
+        if not self.is_identified:
+            return False
+        levels = status["levels"]
+        return len(levels) == self.capabilities["channels"] and not any(levels)
 
     def what_may_play(self, cause: str = "") -> StopOutcome:
         """Return how long it may still play: the only place where that is decided.
@@ -676,19 +686,19 @@ class Amplifier:
             self._check_alone()
             raise
         self._check_alone()
-        # Until identified, it may be another amplifier, whose silence confirms nothing.
-        last_capabilities = self.capabilities
-        self.forget_capabilities()
+        was_identified = self.is_identified
+        self.forget_identification()  # remains so if the identity is wrong
         check_identity(identity, self.name, self._serial_number)
-        self.capabilities = last_capabilities
+        self.is_identified = was_identified
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
         check_capabilities(can, self.name, is_output=self.is_output)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
-        elif can != self.capabilities:
+        elif not self.is_identified or can != self.capabilities:
             self._ledger.adopt(can)
         self.identity = identity
         self.capabilities = can
+        self.is_identified = True
         self.exchange_time = cache(self._exchange_time)
         status_words = reply_words("GetStatus", can["channels"], can["layers"])
         self.clock.identified(can["clock_error"], bits=self.line.wire.transit(status_words))
@@ -696,14 +706,14 @@ class Amplifier:
         self.latch = None
         return await self.read_status()
 
-    def forget_capabilities(self) -> None:
-        """Forget the capabilities, so that no status confirms silence until it is identified."""
-        self.capabilities = {}
+    def forget_identification(self) -> None:
+        """Let no status confirm silence until the amplifier is identified again."""
+        self.is_identified = False
 
     def _check_alone(self) -> None:
         """Raise LinkError if several amplifiers replied: the silence of one proves nothing."""
         if self._are_several:
-            self.forget_capabilities()
+            self.forget_identification()
             raise WrongAmplifier(
                 f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
                 f"{self.line.name}; give each its own: era amp address --serial-number"

@@ -59,13 +59,13 @@ from drivers.protocol.definition import (
     LATCHED,
     LAYER,
     MAX_AHEAD,
-    MESSAGES,
     QUANTITIES,
     REPLY_TIMEOUT,
+    REQUESTS,
     SET_WORDS,
     STATES,
-    STATUS,
     STOP_RAMP,
+    Message,
     name_of,
 )
 from drivers.protocol.records import Values
@@ -104,10 +104,10 @@ _WATCHDOG = QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _WIRE_ROUNDING = 0.5  # steps of the wire, in addition to half a step of the amplifier
 _LEFT = QUANTITIES["watchdog_left"]
-_SILENCING = ("Stop", "Disarm", "Silence")
-_CHANGING = ("Arm", "Disarm", "Stop", "Clear")
-# A request that changes the state may be preceded by an event, in a frame of its own of 7 words.
+_COMMIT = REQUESTS["Commit"]
+_PING = REQUESTS["Ping"]
 _EVENT_WORDS = EVENT_RECORD.words + 7
+"""Words of an event, which may come before a reply in a frame of its own of 7 words."""
 _SURELY = 3.0  # standard errors of a clock
 _MAX_START_ERROR = 0.003  # s; if a start is known worse than this, statuses are not compared
 COMMITTING = 0.1
@@ -281,7 +281,7 @@ class Amplifier:
             channels = self.capabilities["channels"]
             layers = self.capabilities["layers"]
         words = reply_words(name, channels, layers)
-        if name in _CHANGING:
+        if REQUESTS[name].changes_state:
             words += _EVENT_WORDS
         return self.line.wire.exchange_time(request_words(name), words)
 
@@ -389,11 +389,13 @@ class Amplifier:
         once a status has shown that it is not armed. For a set and its commit it raises Preempted
         if the set is no longer admitted, and CommandRefused if it is too late.
         """
-        if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
+        message = REQUESTS[name]
+        if message.silences or not message.feeds:
             return
-        if name == "Set" or (name == "Commit" and values["token"] != self.committed):
+        is_repeated = message is _COMMIT and values["token"] == self.committed
+        if message.plays and not is_repeated:
             self._check_admitted(values["token"], priority)
-        if name == "Arm":
+        if message.arms:
             stops_sent, until = self.arming
             if self.stops_sent != stops_sent:
                 raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
@@ -406,7 +408,7 @@ class Amplifier:
                 f"{self.no_reply_cause}. The amplifier may play its last set until its watchdog "
                 "has passed; nothing new is played until it replies"
             )
-        if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
+        if not message.arms and self.status is not None and self.status["state"] != ENABLED:
             raise _disarmed(self.name, self.status)
 
     def _check_admitted(self, token: int, priority: Priority) -> None:
@@ -424,40 +426,41 @@ class Amplifier:
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
+        message = REQUESTS[name]
         self._checked = None
-        if name != "Set":  # the reply to a Set shows no clock
+        if message.shows_clock:
             # Earlier requests may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
-        if name == "Hello":
-            return
-        if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
-            self._note_possible_feeding(name, values, now, arrives)
-        elif name in ("Stop", "Disarm"):
+        if message.feeds and (message.arms or values["session"] == self.session):
+            self._note_possible_feeding(message, values, now, arrives)
+        elif message.disarms:
             self.feeding.fade = max(self.feeding.fade, _RAMP.from_wire(values["ramp"]))
             self.stops_sent += 1
         admitted = self._admitted
-        if name == "Arm":
+        if message.arms:
             self._admitted = None
             self.may_be_armed = True
             self.stop_outcome = replace(
                 self.stop_outcome, is_confirmed=False, may_play_until=-math.inf
             )
-        elif name in _SILENCING:
+        elif message.silences:
             self._admitted = None
-            if name == "Silence" and self._ledger is not None:
+            if not message.disarms and self._ledger is not None:
                 self.played_at = now
                 self._ledger.may_be_silent.update(range(self._ledger.capabilities["layers"]))
-        elif admitted is not None and values.get("token") == admitted.token:
-            if name == "Commit":
+        elif message.plays and admitted is not None and values["token"] == admitted.token:
+            if message is _COMMIT:
                 self._note_commit(admitted, now, arrives)
-            elif name == "Set" and values["now"] and is_last(values):
+            elif values["now"] and is_last(values):
                 self._note_immediate_start(admitted, now, arrives)
 
-    def _note_possible_feeding(self, name: str, values: Values, now: float, arrives: float) -> None:
+    def _note_possible_feeding(
+        self, message: Message, values: Values, now: float, arrives: float
+    ) -> None:
         """Note a request that feeds the watchdog if it arrives."""
         feeding = self.feeding
         feeding.may = now
-        if name == "Silence" and self.no_reply_cause is not None:
+        if message.silences and self.no_reply_cause is not None:
             # If it arrives, it does so within the time of the watchdog, and its ramp follows.
             # Repeating it without reply does not put off when the amplifier must be silent.
             feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
@@ -495,14 +498,12 @@ class Amplifier:
         now = self._time()
         self._checked = None
         self.counts.last_round_trip = now - sent_at
-        message = MESSAGES.get(name)
-        if message is None:
-            return
+        message = REQUESTS[name]
         if message.feeds:
             self._note_feeding(sent_at, now)
-        if message.reply is STATUS:
-            self._note_status(name, values, reply, sent_at, now)
-        elif name == "Set" and reply["played"]:
+        if message.shows_clock:
+            self._note_status(message, values, reply, sent_at, now)
+        elif message.plays and reply["played"]:
             self._confirm(values["token"], now)
 
     def _note_feeding(self, sent_at: float, now: float) -> None:
@@ -515,7 +516,7 @@ class Amplifier:
             feeding.fade = 0.0
 
     def _note_status(
-        self, name: str, values: Values, status: Values, sent_at: float, now: float
+        self, message: Message, values: Values, status: Values, sent_at: float, now: float
     ) -> None:
         """Note a status that replies to a request sent at a time [s], see `note_reply`."""
         latch = status["latch"]
@@ -526,12 +527,12 @@ class Amplifier:
         is_enabled = status["state"] == ENABLED
         # Heartbeats show the same as the status of a Commit, unless it may show a Mark, or that the
         # amplifier is no longer armed.
-        if name != "Commit" or len(self.line.members) > 1 or not is_enabled:
-            self.clock.replied(name, values, status, now)
+        if message is not _COMMIT or len(self.line.members) > 1 or not is_enabled:
+            self.clock.replied(message.name, values, status, now)
         for kind in reports_of(status, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger = self._ledger
-        if ledger is not None and name in _SILENCING:
+        if ledger is not None and message.silences:
             ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             self.committed = status["token"]
             return
@@ -540,10 +541,10 @@ class Amplifier:
         is_sure = status["token"] != self.committed or sent_at >= self.played_at + COMMITTING
         if ledger is not None and is_sure:
             self._confirm(status["token"], now)
-        if name == "Ping" and not is_enabled:
+        if message is _PING and not is_enabled:
             raise _disarmed(self.name, status)
-        if ledger is not None and self.session and is_enabled and name not in ("Arm", "Clear"):
-            self._compare(ledger, status, sent_at, now, is_fed=MESSAGES[name].feeds)
+        if ledger is not None and self.session and is_enabled and not message.changes_state:
+            self._compare(ledger, status, sent_at, now, is_fed=message.feeds)
 
     def _compare(
         self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool

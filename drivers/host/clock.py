@@ -36,6 +36,7 @@ from drivers.protocol.definition import (
     HIGH_TIME,
     HIGH_WORDS,
     QUANTITIES,
+    REQUESTS,
     SPAN,
     STATUS_FLAGS,
     ahead,
@@ -164,10 +165,6 @@ _STEP = CLOCK_TURN / SPAN
 """Step [s] of a clock on the wire."""
 _PER_RATE = QUANTITIES["rate"].per_unit
 _PER_ERROR = QUANTITIES["clock_error"].per_unit
-
-
-_ENDING = ("Stop", "Disarm")
-"""Requests after whose reply it is known since when the rate is 0."""
 
 
 class _Steering(NamedTuple):
@@ -600,6 +597,7 @@ class HeldClock:
         was_armed = self._is_armed
         self._is_armed = status["state"] == ENABLED
         is_still_armed = was_armed and self._is_armed
+        was_disarmed = was_armed and not self._is_armed
         if self.is_alone:
             is_reported = is_still_armed and name != "Arm" and not mark_count
             self._check_pace(status["clock"], received, is_reported=is_reported)
@@ -611,7 +609,7 @@ class HeldClock:
         if name == "Arm" and self._is_armed:
             self._steered_lead += values["shift"] * HIGH_TIME
             self._near_at = time
-        elif self._unconfirmed_shift or (was_armed and not self._is_armed and name not in _ENDING):
+        elif self._unconfirmed_shift or (was_disarmed and not REQUESTS[name].disarms):
             self._forget(time)  # it is unknown if it was shifted, or when its rate ended
         self._unconfirmed_shift = 0
         self._min_exchange = min(self._min_exchange, received - time - self._reply_bits)

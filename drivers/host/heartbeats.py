@@ -19,7 +19,7 @@ from drivers.host.joint_sets import JointSets, commit_of, word_passed_by_all
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
 from drivers.host.requests import Make, Priority
-from drivers.protocol.definition import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT, REQUESTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 
@@ -154,7 +154,8 @@ class Heartbeats:
         again, which changes nothing on amplifiers that have committed it, and is due on the others
         anyway. Nothing is fed before a status, which would then not show the watchdog running down.
         """
-        if priority not in (Priority.HEARTBEAT, Priority.SET) or name == "GetStatus":
+        is_routine = priority in (Priority.HEARTBEAT, Priority.SET)
+        if not is_routine or REQUESTS[name].shows_watchdog:
             return None
         limit = HEARTBEAT
         if line.late <= GRACE:

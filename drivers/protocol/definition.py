@@ -250,14 +250,42 @@ _ACHIEVED = Record(
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A request with its number, and the record of its reply."""
+    """A request with its number, the record of its reply, and its effects on an amplifier."""
 
     name: str
     number: int
     request: Record
     reply: Record
     is_broadcast: bool = False
+    """Whether it can be sent to all amplifiers of a line together, without a reply."""
     feeds: bool = False
+    """Whether it feeds the watchdog."""
+    plays: bool = False
+    """Whether it stages or starts a set, which the ledger must have admitted."""
+    silences: bool = False
+    """Whether it ends all playback."""
+    changes_state: bool = False
+    """Whether it can change the state; an event may then come before the reply."""
+
+    @property
+    def arms(self) -> bool:
+        """Whether it switches the high voltage on."""
+        return self.feeds and self.changes_state
+
+    @property
+    def disarms(self) -> bool:
+        """Whether it switches the high voltage off after the ramp."""
+        return self.silences and self.changes_state
+
+    @property
+    def shows_clock(self) -> bool:
+        """Whether its reply is a Status, which shows the clock."""
+        return self.reply is STATUS
+
+    @property
+    def shows_watchdog(self) -> bool:
+        """Whether its reply shows how the watchdog runs down."""
+        return self.shows_clock and not self.feeds
 
 
 EVENT: Final = 30
@@ -288,17 +316,19 @@ _ANY_RAMP = _record("ramp:any_ramp")
 """A ramp above the maximum counts as the maximum: nothing keeps an amplifier from silence."""
 _SET_ADDRESS = Record(*_numbers("address"), Text("serial_number"))
 
+_SILENCE = _record("session", "ramp")
+
 _MESSAGES = (
     Message("GetCaps", 2, _NOTHING, _CAPABILITIES),
-    Message("Arm", 3, _ARM, STATUS, feeds=True),
-    Message("Disarm", 4, _ANY_RAMP, STATUS),
-    Message("Set", 5, _SET, _TAKEN, feeds=True),
-    Message("Commit", 6, _COMMIT, STATUS, is_broadcast=True, feeds=True),
-    Message("Silence", 7, _record("session", "ramp"), STATUS, feeds=True),
-    Message("Stop", 8, _ANY_RAMP, STATUS, is_broadcast=True),
+    Message("Arm", 3, _ARM, STATUS, feeds=True, changes_state=True),
+    Message("Disarm", 4, _ANY_RAMP, STATUS, silences=True, changes_state=True),
+    Message("Set", 5, _SET, _TAKEN, feeds=True, plays=True),
+    Message("Commit", 6, _COMMIT, STATUS, is_broadcast=True, feeds=True, plays=True),
+    Message("Silence", 7, _SILENCE, STATUS, feeds=True, silences=True),
+    Message("Stop", 8, _ANY_RAMP, STATUS, is_broadcast=True, silences=True, changes_state=True),
     Message("GetStatus", 9, _NOTHING, STATUS),
     Message("GetFaults", 10, _NOTHING, _FAULTS),
-    Message("Clear", 11, _record("latch"), STATUS),
+    Message("Clear", 11, _record("latch"), STATUS, changes_state=True),
     Message("Ping", 12, _record("session", "rate"), STATUS, feeds=True),
     Message("GetAchieved", 13, _record("layer"), _ACHIEVED),
     Message("GetMeasured", 14, _NOTHING, _MEASURED),

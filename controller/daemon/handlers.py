@@ -59,7 +59,7 @@ from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.play.intent import MAX_DB_SL
 from controller.sources.touch import Contact, Touch, TouchFrame
-from drivers.host.ledger import StopOutcome
+from drivers.host.stops import StopOutcome
 from model.compiled.kernels import why_slow
 from model.errors import InputError
 from model.finger import STRONG_DB_SL

@@ -12,7 +12,7 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group
 from drivers.host.group_states import GroupState
-from drivers.host.ledger import UNREACHED, StopOutcome
+from drivers.host.stops import UNREACHED, StopOutcome
 from drivers.opening import Lines
 from drivers.protocol.definition import REPLY_TIMEOUT
 from model.answer.answer_report import Timing
@@ -271,7 +271,7 @@ async def _identified(
 ) -> Mapping[str, StopOutcome]:
     """Await a stop while identifying amplifiers: unknown amplifiers confirm nothing."""
     for amplifier in amplifiers:
-        amplifier.forget_identification()
+        amplifier.identification.forget()
     requests = [amplifier.identify(timeout=REPLY_TIMEOUT) for amplifier in amplifiers]
     identifying = asyncio.gather(*requests, return_exceptions=True)
     try:

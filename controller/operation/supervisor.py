@@ -48,7 +48,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import Amplifier
 from drivers.host.group_states import GroupState
-from drivers.host.ledger import StopOutcome
+from drivers.host.stops import StopOutcome
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
 from drivers.protocol.records import Values
 from model.errors import InputError

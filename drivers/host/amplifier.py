@@ -1,7 +1,10 @@
-"""One amplifier of protocol 4 on any wire: its requests, replies and stops.
+"""One amplifier of protocol 4 on any wire: its requests, and what their replies show.
 
-`Amplifier` identifies, arms, plays, silences, disarms and stops one amplifier. It keeps session,
-latch, status and ledger, and raises CommandRefused once replies contradict the requests.
+`Amplifier` identifies, arms, plays, silences, disarms and stops one amplifier. Each request and
+each reply is noted by the objects that keep its state: `AmplifierIdentification`, `SetAdmission`
+(which set may be sent) with the `Ledger`, `Feeding` (the watchdog), `HeldClock`,
+`StatusContradictions`, and `PlaybackBound` with `PendingStop`. `what_may_play` concludes from them
+what it may still play.
 """
 
 import asyncio
@@ -9,9 +12,9 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
-from typing import Any, TypeAlias
+from typing import Any
 
 from drivers.errors import (
     CommandError,
@@ -19,46 +22,30 @@ from drivers.errors import (
     FrameError,
     LinkDegraded,
     LinkTimeout,
-    Overtaken,
     Preempted,
-    WrongAmplifier,
 )
-from drivers.host.bounds import COMMIT_DELAY
-from drivers.host.clock import (
-    REPORT_LIFE,
-    REPORTS,
-    HeldClock,
-    ReportKind,
-    armed_problem,
-    reports_of,
+from drivers.host.clock import REPORT_LIFE, REPORTS, HeldClock, ReportKind, reports_of
+from drivers.host.contradictions import (
+    MAX_CONTRADICTIONS,
+    MAX_START_ERROR,
+    StatusContradictions,
+    contradicted,
 )
-from drivers.host.contradictions import MAX_CONTRADICTIONS, StatusContradictions
-from drivers.host.ledger import (
-    UNREACHED,
-    Feeding,
-    Ledger,
-    PendingStop,
-    StagedSet,
-    StopOutcome,
-    check_capabilities,
-    check_identity,
-)
+from drivers.host.identification import AmplifierIdentification, driven_by_another
+from drivers.host.ledger import Ledger, StagedSet
 from drivers.host.line import Line
 from drivers.host.requests import LinkStatistics, Priority
+from drivers.host.set_admission import IsPreempted, SetAdmission, SetRequest
+from drivers.host.stops import CONFIRM_INTERVAL, PendingStop, PlaybackBound, StopOutcome
+from drivers.host.watchdog import Feeding
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     ATTEMPTS,
-    COMMAND,
     ENABLED,
-    ENVELOPE,
     EVENT_RECORD,
     FAST,
     FAULTS,
     HIGH_TIME,
-    KNOT,
-    LATCHED,
-    LAYER,
-    MAX_AHEAD,
     QUANTITIES,
     REPLY_TIMEOUT,
     REQUESTS,
@@ -70,15 +57,11 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
-    PART_WORDS,
     LayerSet,
     achieved_layer,
     achieved_problem,
     is_last,
     is_newer_token,
-    is_vibrating,
-    pack_layers,
-    parts,
 )
 from drivers.wires.wire import (
     WIDEST,
@@ -98,53 +81,18 @@ _ARM_WITHIN = 3.0  # s; an Arm sent later than this after its request is too lat
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; how long the host listens for another one if it finds an armed amplifier
 SECOND_REPLY = 0.02  # s; how long it waits for a second amplifier at the same address
-_INTERVAL = 0.005  # s; between two attempts to stop, in addition to the ramp
 _RAMP = QUANTITIES["ramp"]
 _WATCHDOG = QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _WIRE_ROUNDING = 0.5  # steps of the wire, in addition to half a step of the amplifier
-_LEFT = QUANTITIES["watchdog_left"]
 _COMMIT = REQUESTS["Commit"]
 _PING = REQUESTS["Ping"]
 _EVENT_WORDS = EVENT_RECORD.words + 7
 """Words of an event, which may come before a reply in a frame of its own of 7 words."""
 _SURELY = 3.0  # standard errors of a clock
-_MAX_START_ERROR = 0.003  # s; if a start is known worse than this, statuses are not compared
 COMMITTING = 0.1
 """Time [s] within which a commit arrives and is carried out."""
-_CHECKED_FOR = 0.005  # s; a check holds for so long unless anything is sent or received
-IsPreempted: TypeAlias = Callable[[], bool]
-"""Whether something more urgent waits, so that a set that does not play yet is dropped."""
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class _CheckedSet:
-    """Layers that the ledger admits, ready to be staged."""
-
-    layers: Sequence[AmplifierLayer]
-    """The layers as requested."""
-    admitted: tuple[LayerSet, ...]
-    """The layers as admitted."""
-    stream: list[int]
-    """The admitted layers as words of the wire."""
-    delay: float
-    """Longest time from staging until they are committed [s]."""
-    valid_until: float
-    """Until when the check is valid [s], if nothing is sent or received meanwhile."""
-
-
-@dataclass
-class _SetRequest:
-    """A set that is checked when its turn on the line comes."""
-
-    token: int
-    layers: Sequence[AmplifierLayer]
-    now: bool
-    """Whether it plays immediately."""
-    is_preempted: IsPreempted | None
-    staged: StagedSet | None = None
-    """The set as it was made last."""
 
 
 class Amplifier:
@@ -155,23 +103,14 @@ class Amplifier:
     motion of a stiff source, None for either.
     """
 
-    is_identified: bool = False
-    """Whether it is known to be the expected amplifier, with these capabilities.
-
-    No status confirms silence before: it may be of another amplifier, or lack channels.
-    """
-    identity: Values
-    """Values of its identity record, as read last; empty before."""
-    capabilities: Values
-    """Values of its capabilities record, as read last; empty before."""
+    identification: AmplifierIdentification
+    """What it has reported about itself."""
     exchange_time: Callable[[str], float]
     """Return how long the longest request with a name and its reply take on the wire [s]."""
     counts: LinkStatistics
     """Counts of the requests to it."""
     listeners: list[Callable[[Values], None]]
     """They are called with the values of each event."""
-    _serial_number: str | None
-    """Expected serial number, or the one that it had when it was first identified."""
 
     # Status
     status: Values | None = None
@@ -184,22 +123,16 @@ class Amplifier:
     """When a status last had a report of each kind [s]."""
     contradictions: StatusContradictions
     """Statuses in a row that contradict the requests sent."""
-    _misachieved: int = 0
-    """Number of contradictory achieved layers in a row."""
-    _other_host_at: float = -math.inf
-    """When another host was heard last [s]."""
-    _are_several: bool = False
-    """Whether two amplifiers have replied since this was reset."""
 
     # Arming
     session: int = 0
     """Session of the last Arm."""
     may_be_armed: bool = False
     """Whether it may have carried out an Arm of this host since it was last disarmed."""
-    arming: tuple[int, float] = (0, -math.inf)
-    """`stops_sent` when Arm was requested, and the time [s] until which the Arm may go out."""
-    armed_latch: int | None = None
-    """Latch in the reply to the last Arm."""
+    _stops_before_arm: int = 0
+    """`stops_sent` when Arm was requested: a later stop prevents it."""
+    _arms_until: float = -math.inf
+    """Until when the requested Arm may go out [s]."""
     feeding: Feeding
     """When its watchdog was fed."""
     clock: HeldClock
@@ -212,21 +145,14 @@ class Amplifier:
     """Start time [s] of the staged set if committed next; a time in the past: immediately."""
     committed: int = 0
     """Token of the set that it committed last; 0 if it committed none since it was armed."""
-    _may_wait_until: float = -math.inf
-    """Latest start of the last set with a poor clock [s]."""
-    _is_start_known: bool = True
-    """Whether the start is known well enough to compare statuses with the sent sets."""
     _ledger: Ledger | None = None
     """None until it is identified."""
-    _admitted: StagedSet | None = None
-    """The set that is staged and not committed yet."""
-    _checked: _CheckedSet | None = None
-    """The layers that were checked last, if this check can be used again."""
+    _sets: SetAdmission
+    """Which set may be sent to it."""
 
     # Stops
-    stop_outcome: StopOutcome = UNREACHED
-    """Its possible output after the last stop, without the evidence of statuses and watchdog;
-    `what_may_play` has the conclusion."""
+    playback_bound: PlaybackBound
+    """What its last stop, Clear or Arm shows about the end of its playback."""
     no_reply_cause: str | None = None
     """Why it is degraded: it did not reply to a request, and may still play."""
     stops_sent: int = 0
@@ -248,19 +174,33 @@ class Amplifier:
         self.address = address
         self.name = name
         self.limits = limits
-        self.is_output = is_output
-        self.capabilities = {}
-        self.identity = {}
+        self.identification = AmplifierIdentification(
+            name,
+            f"address {address} on {line.name}",
+            serial_number=serial_number,
+            is_output=is_output,
+        )
         self.reported_at = {}
-        self.contradictions = StatusContradictions()
+        self.contradictions = StatusContradictions(name)
         self.listeners = []
         self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.clock = HeldClock()
         self.counts = LinkStatistics()
         self.exchange_time = cache(self._exchange_time)
-        self._serial_number = serial_number
+        self._sets = SetAdmission(name, self.identification)
+        self.playback_bound = PlaybackBound()
         self._time = line.time
         line.members[address] = self
+
+    @property
+    def identity(self) -> Values:
+        """Values of its identity record, as read last; empty before."""
+        return self.identification.identity
+
+    @property
+    def capabilities(self) -> Values:
+        """Values of its capabilities record, as read last; empty before."""
+        return self.identification.capabilities
 
     @property
     def ledger(self) -> Ledger:
@@ -277,7 +217,7 @@ class Amplifier:
     def _exchange_time(self, name: str) -> float:
         """Return how long the longest request with this name and its reply take on the wire [s]."""
         channels, layers = WIDEST
-        if self.is_identified:
+        if self.identification.is_complete:
             channels = self.capabilities["channels"]
             layers = self.capabilities["layers"]
         words = reply_words(name, channels, layers)
@@ -300,7 +240,7 @@ class Amplifier:
         CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
         a row have another token.
         """
-        request = _SetRequest(token, layers, now, is_preempted)
+        request = SetRequest(token, layers, now, is_preempted)
         for _ in range(MAX_CONTRADICTIONS):
             reply = await self.line.submit(self, priority, "Set", partial(self._make_set, request))
             if reply["token"] == token:
@@ -308,58 +248,26 @@ class Amplifier:
         else:
             problem = f"a set with token {token} must be taken, got token {reply['token']}"
             # This is not a rejection: the group stops all amplifiers.
-            raise FrameError(str(_contradicted(self.name, problem)))
+            raise FrameError(str(contradicted(self.name, problem)))
         staged = request.staged
-        is_staged = reply["staged"] and not now and self._admitted is staged
+        is_staged = reply["staged"] and not now and self._sets.admitted is staged
         if staged is None or not (reply["played"] or is_staged):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if reply["exact"] else replace(staged, is_exact=False)
 
-    def _make_set(self, request: _SetRequest) -> list[Values]:
-        """Check a set, and return the values of its parts; raises CommandRefused or Overtaken."""
-        token = request.token
-        if request.is_preempted is not None and request.is_preempted():
-            raise Overtaken(f"amplifier {self.name}: set {token} is preempted")
-        moment = self._time()
-        checked = self._checked
-        if checked is None or checked.layers is not request.layers or moment > checked.valid_until:
-            checked = self._check(request.layers, moment)
-        self._checked = None
-        messages = parts(checked.stream, session=self.session, token=token, now=request.now)
-        request.staged = StagedSet(token, checked.admitted, True, until=moment + checked.delay)
-        self._admitted = request.staged
-        return messages
+    def _make_set(self, request: SetRequest) -> list[Values]:
+        """Admit a set, and return the values of its parts; raises CommandRefused or Overtaken."""
+        return self._sets.admit(
+            request, self.ledger, self._time(), session=self.session, set_time=self._sets_time()
+        )
 
     def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
-        """Return why the ledger would not admit layers now; None if it would.
+        """Return why the ledger would not admit layers now; None if it would."""
+        return self._sets.refusal_of(layers, self.ledger, self._time(), set_time=self._sets_time())
 
-        The result is used again if the layers are staged within 5 ms and nothing is sent or
-        received meanwhile.
-        """
-        moment = self._time()
-        try:
-            self._checked = self._check(layers, moment, valid_for=_CHECKED_FOR)
-        except CommandRefused as error:
-            return error
-        return None
-
-    def _check(
-        self, layers: Sequence[AmplifierLayer], moment: float, *, valid_for: float = 0.0
-    ) -> _CheckedSet:
-        """Check layers for staging within a time after a moment [s]; raises CommandRefused."""
-        set_time = len(self.line.members) * self.exchange_time("Set")
-        delay = max(COMMIT_DELAY, ATTEMPTS * set_time)
-        words = _word_count(layers)
-        if words > PART_WORDS:  # parts for all amplifiers of the line, each perhaps repeated
-            delay += 2 * words / PART_WORDS * set_time
-        admitted = self.ledger.admit(layers, moment, delay=delay + valid_for)
-        stream = pack_layers(admitted)
-        if not self.is_identified and is_vibrating(*admitted):
-            raise CommandRefused(f"amplifier {self.name} must be identified first; open it again")
-        max_words = self.ledger.capabilities["set_words"]
-        if len(stream) > max_words:
-            raise CommandRefused(f"a set must have at most {max_words} words, got {len(stream)}")
-        return _CheckedSet(layers, admitted, stream, delay, moment + valid_for)
+    def _sets_time(self) -> float:
+        """Return how long sets to all amplifiers of the line take [s]."""
+        return len(self.line.members) * self.exchange_time("Set")
 
     def set_start(self, moment: float | None) -> None:
         """Set when the staged set starts [s] once it is committed; None: immediately."""
@@ -393,16 +301,14 @@ class Amplifier:
         if message.silences or not message.feeds:
             return
         is_repeated = message is _COMMIT and values["token"] == self.committed
+        now = self._time()
         if message.plays and not is_repeated:
-            self._check_admitted(values["token"], priority)
+            # A set that only silences, or changes nothing, is never too late.
+            may_be_late = priority is not Priority.SET
+            self._sets.check(values["token"], now, may_be_late=may_be_late)
         if message.arms:
-            stops_sent, until = self.arming
-            if self.stops_sent != stops_sent:
-                raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-            if self._time() > until:  # this machine slept, and the caller does not expect it now
-                raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
-        if self._other_host_at > -math.inf:
-            self.check_other_host()
+            self._check_may_arm(now)
+        self.identification.check_other_host(now)
         if self.no_reply_cause is not None:
             raise LinkDegraded(
                 f"{self.no_reply_cause}. The amplifier may play its last set until its watchdog "
@@ -411,82 +317,73 @@ class Amplifier:
         if not message.arms and self.status is not None and self.status["state"] != ENABLED:
             raise _disarmed(self.name, self.status)
 
-    def _check_admitted(self, token: int, priority: Priority) -> None:
-        """Raise Preempted or CommandRefused unless the set with a token may be sent now."""
-        admitted = self._admitted
-        if admitted is None or admitted.token != token:
-            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
-        now = self._time()
-        if now > admitted.until and priority is Priority.SET:  # silence is never too late
-            raise CommandRefused(
-                f"amplifier {self.name}: set {token} must be committed "
-                f"{now - admitted.until:.3g} s earlier; the wire is too slow or too busy",
-                until=now,
-            )
+    def _check_may_arm(self, now: float) -> None:
+        """Raise Preempted or LinkTimeout if a requested Arm must not be sent any more."""
+        if self.stops_sent != self._stops_before_arm:
+            raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+        if now > self._arms_until:  # this machine slept, and the caller does not expect it now
+            raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
 
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
         message = REQUESTS[name]
-        self._checked = None
+        self._sets.expire_check()
         if message.shows_clock:
             # Earlier requests may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
         if message.feeds and (message.arms or values["session"] == self.session):
             self._note_possible_feeding(message, values, now, arrives)
         elif message.disarms:
-            self.feeding.fade = max(self.feeding.fade, _RAMP.from_wire(values["ramp"]))
+            self.feeding.note_ramp(_RAMP.from_wire(values["ramp"]))
             self.stops_sent += 1
-        admitted = self._admitted
         if message.arms:
-            self._admitted = None
+            self._sets.withdraw()
             self.may_be_armed = True
-            self.stop_outcome = replace(
-                self.stop_outcome, is_confirmed=False, may_play_until=-math.inf
-            )
+            self.playback_bound.note_armed()
         elif message.silences:
-            self._admitted = None
+            self._sets.withdraw()
             if not message.disarms and self._ledger is not None:
                 self.played_at = now
                 self._ledger.may_be_silent.update(range(self._ledger.capabilities["layers"]))
-        elif message.plays and admitted is not None and values["token"] == admitted.token:
-            if message is _COMMIT:
-                self._note_commit(admitted, now, arrives)
-            elif values["now"] and is_last(values):
-                self._note_immediate_start(admitted, now, arrives)
+        elif message.plays:
+            self._note_set_sent(message, values, now, arrives)
 
     def _note_possible_feeding(
         self, message: Message, values: Values, now: float, arrives: float
     ) -> None:
         """Note a request that feeds the watchdog if it arrives."""
-        feeding = self.feeding
-        feeding.may = now
         if message.silences and self.no_reply_cause is not None:
-            # If it arrives, it does so within the time of the watchdog, and its ramp follows.
-            # Repeating it without reply does not put off when the amplifier must be silent.
-            feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+            self.feeding.note_repeated_silence(now, _RAMP.from_wire(values["ramp"]))
         else:
-            feeding.plays = now
-            feeding.arrives = arrives
-            feeding.fade = 0.0
+            self.feeding.note_sent(now, arrives)
+
+    def _note_set_sent(self, message: Message, values: Values, now: float, arrives: float) -> None:
+        """Note a part of a set or its commit, with which the admitted set may begin to play."""
+        admitted = self._sets.admitted
+        if admitted is None or values["token"] != admitted.token:
+            return
+        if message is _COMMIT:
+            self._note_commit(admitted, now, arrives)
+        elif values["now"] and is_last(values):
+            self._note_immediate_start(admitted, now, arrives)
 
     def _note_commit(self, admitted: StagedSet, now: float, arrives: float) -> None:
         """Note the commit of a set, which starts at `_starts_at`, or when the commit arrives."""
         error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
-        self._is_start_known = error <= _MAX_START_ERROR
-        self._may_wait_until = now + MAX_AHEAD
+        self.contradictions.note_commit(now, error)
         if self._starts_at <= now:
             self.played_at = arrives
             self.ledger.sent(admitted.token, admitted.layers, now)
             return
         self.played_at = self._starts_at
-        start_error = min(max(error, HIGH_TIME), _MAX_START_ERROR)
+        start_error = min(max(error, HIGH_TIME), MAX_START_ERROR)
         self.ledger.sent(
             admitted.token, admitted.layers, now, starts=self._starts_at, error=start_error
         )
 
     def _note_immediate_start(self, admitted: StagedSet, now: float, arrives: float) -> None:
         """Note a set that starts when it arrives."""
-        self._may_wait_until = -math.inf
+        self.contradictions.note_immediate_start()
         self.played_at = arrives
         self.ledger.sent(admitted.token, admitted.layers, now)
 
@@ -496,24 +393,15 @@ class Amplifier:
         Raises CommandRefused if two consecutive statuses contradict the requests sent.
         """
         now = self._time()
-        self._checked = None
+        self._sets.expire_check()
         self.counts.last_round_trip = now - sent_at
         message = REQUESTS[name]
         if message.feeds:
-            self._note_feeding(sent_at, now)
+            self.feeding.note_reply(sent_at, now)
         if message.shows_clock:
             self._note_status(message, values, reply, sent_at, now)
         elif message.plays and reply["played"]:
             self._confirm(values["token"], now)
-
-    def _note_feeding(self, sent_at: float, now: float) -> None:
-        """Note that a request has surely fed the watchdog."""
-        feeding = self.feeding
-        feeding.since = sent_at
-        feeding.confirmed_at = now
-        if sent_at > feeding.plays:
-            feeding.plays = sent_at
-            feeding.fade = 0.0
 
     def _note_status(
         self, message: Message, values: Values, status: Values, sent_at: float, now: float
@@ -544,53 +432,26 @@ class Amplifier:
         if message is _PING and not is_enabled:
             raise _disarmed(self.name, status)
         if ledger is not None and self.session and is_enabled and not message.changes_state:
-            self._compare(ledger, status, sent_at, now, is_fed=message.feeds)
-
-    def _compare(
-        self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool
-    ) -> None:
-        """Compare the status of an armed amplifier with the requests that were sent.
-
-        is_fed: whether the request for the status feeds the watchdog. Raises CommandRefused for the
-        second contradiction in a row.
-        """
-        problem = self._problem_of(ledger, status, sent_at, now, is_fed=is_fed)
-        if problem is None:
-            # The reply to a request that feeds does not show how the watchdog runs down.
-            shows_watchdog = not is_fed and self.feeding.tells(sent_at)
-            self.contradictions.note_agreement(shows_watchdog=shows_watchdog)
-        elif self.contradictions.note_contradiction(now, is_fed=is_fed):
-            raise _contradicted(self.name, problem)
-
-    def _problem_of(
-        self, ledger: Ledger, status: Values, sent_at: float, now: float, *, is_fed: bool
-    ) -> str | None:
-        """Describe a contradiction in the status of an armed amplifier; None without one."""
-        problem = armed_problem(status, self.armed_latch)
-        if problem is None and not is_fed:
-            left = status["watchdog_left"] / _LEFT.per_unit
-            problem = self.feeding.problem(left, sent_at, now)
-        if problem is not None:
-            return problem
-        problem = ledger.problem_of(status, sent_at, now)
-        if problem is None or sent_at >= self._may_wait_until:
-            return problem
-        # If its clock is not synchronised, a set may wait even though it was committed.
-        is_synchronised = self._is_start_known and self.clock.error(now) < math.inf
-        return problem if is_synchronised else None
+            self.contradictions.compare(
+                status,
+                sent_at,
+                now,
+                is_fed=message.feeds,
+                ledger=ledger,
+                feeding=self.feeding,
+                clock=self.clock,
+            )
 
     def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
         """Note a message that came without a request; an event is passed to the listeners."""
-        if isinstance(arrival, OtherHost):
-            self._other_host_at = self._time()
-        elif isinstance(arrival, DuplicateAddress):
-            self._are_several = True
-        else:
-            for listener in self.listeners:
-                try:
-                    listener(arrival.values)
-                except Exception:
-                    _logger.exception("amplifier %s: a listener failed", self.name)
+        if not isinstance(arrival, Event):
+            self.identification.note_other(arrival, self._time())
+            return
+        for listener in self.listeners:
+            try:
+                listener(arrival.values)
+            except Exception:
+                _logger.exception("amplifier %s: a listener failed", self.name)
 
     def _note_report(self, kind: ReportKind, now: float) -> None:
         """Note a report of a status, and log it unless there was one a short time ago."""
@@ -607,59 +468,60 @@ class Amplifier:
         if math.isnan(ramp):
             return _RAMP.to_wire(STOP_RAMP)
         wire_ramp = _RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high))
-        if not self.is_identified:
+        if not self.identification.is_complete:
             return wire_ramp
         ramp_max: int = self.capabilities["ramp_max"]
         return min(wire_ramp, ramp_max)
 
     def is_silent(self, status: Values) -> bool:
         """Whether a status shows the levels of all channels, all zero."""
-        if not self.is_identified:
+        if not self.identification.is_complete:
             return False
         levels = status["levels"]
         return len(levels) == self.capabilities["channels"] and not any(levels)
 
-    def what_may_play(self, cause: str = "") -> StopOutcome:
-        """Return how long it may still play: the only place where that is decided.
+    def what_may_play(self, cause: str = "", stop: PendingStop | None = None) -> StopOutcome:
+        """Return what it may still play: the only place where that is decided.
 
-        cause: why its state is unknown; by default the reason why it is mute or its line lost. An
-        amplifier that confirmed a stop, and received neither Clear nor Arm since, is silent.
+        cause: why its state is unknown; by default the reason why it is mute or its line lost.
+        stop: the stop whose outcome is wanted; None: without one, its silence is never confirmed.
+        An amplifier that has confirmed a stop, and was sent neither Clear nor Arm since, is silent.
         Otherwise the watchdog ends playback; an amplifier never fed is silent once a status has
         shown it. If it plays although it has confirmed silence, or although its watchdog must have
         silenced it, another host feeds it or it is broken: nothing is certain to silence it.
         """
+        until = self.playback_bound.until
+        if not self.playback_bound.is_stopped:
+            until = max(until, self.feeding.may_play_until)
         status = self.status
         status_at = self.status_at
-        until = self.stop_outcome.may_play_until
-        if not self.stop_outcome.is_confirmed:
-            until = max(until, self.feeding.may_play_until)
         if status is not None and status_at is not None:
             is_armed = status["state"] == ENABLED
             if self.is_silent(status) and not is_armed:
                 until = status_at if until == math.inf else max(until, status_at)
             elif (is_armed or any(status["levels"])) and status_at >= until:
                 until = math.inf
+        if until == -math.inf:
+            until = math.inf
+        is_confirmed = stop is not None and stop.is_confirmed
         cause = cause or self.line.loss or self.no_reply_cause or ""
-        return StopOutcome(False, math.inf if until == -math.inf else until, cause)
+        return StopOutcome(is_confirmed, until, cause)
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host was heard within the longest time of a watchdog."""
-        if self._time() - self._other_host_at <= _WATCHDOG.high:
-            raise _driven_by_another(self.name)
+        self.identification.check_other_host(self._time())
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier has reported the set with this token as the one it plays."""
         self.committed = token
         if self._ledger is not None:
             self._ledger.resolve(token, now)
-        if self._admitted is not None and self._admitted.token == token:
-            self._admitted = None
+        self._sets.note_committed(token)
 
     def go_on_from(self, earlier: "Amplifier") -> None:
         """Adopt the state of the same amplifier from before its line was reopened."""
-        self.stop_outcome = replace(
-            earlier.what_may_play(), is_confirmed=earlier.stop_outcome.is_confirmed
-        )
+        until = earlier.what_may_play().may_play_until
+        self.playback_bound = PlaybackBound(until, earlier.playback_bound.is_stopped)
         self.may_be_armed = earlier.may_be_armed
 
     async def open(self) -> None:
@@ -679,46 +541,28 @@ class Amplifier:
         timeout: for each reply [s]. The newest latch is then the one in this status, because the
         amplifier may have lost power before.
         """
-        self._are_several = False
+        identification = self.identification
+        identification.expect_one()
         try:
             identity = await self.request("Hello", {}, Priority.OTHER, timeout=timeout)
             await asyncio.sleep(SECOND_REPLY)
         except LinkTimeout:
-            self._check_alone()
+            identification.check_alone()
             raise
-        self._check_alone()
-        was_identified = self.is_identified
-        self.forget_identification()  # remains so if the identity is wrong
-        check_identity(identity, self.name, self._serial_number)
-        self.is_identified = was_identified
+        identification.check_alone()
+        identification.check_identity(identity)
         can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
-        check_capabilities(can, self.name, is_output=self.is_output)
+        identification.check_capabilities(can)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
-        elif not self.is_identified or can != self.capabilities:
+        elif not identification.has_same(can):
             self._ledger.adopt(can)
-        self.identity = identity
-        self.capabilities = can
-        self.is_identified = True
+        identification.complete(identity, can)
         self.exchange_time = cache(self._exchange_time)
         status_words = reply_words("GetStatus", can["channels"], can["layers"])
         self.clock.identified(can["clock_error"], bits=self.line.wire.transit(status_words))
-        self._serial_number = identity["serial_number"]
         self.latch = None
         return await self.read_status()
-
-    def forget_identification(self) -> None:
-        """Let no status confirm silence until the amplifier is identified again."""
-        self.is_identified = False
-
-    def _check_alone(self) -> None:
-        """Raise LinkError if several amplifiers replied: the silence of one proves nothing."""
-        if self._are_several:
-            self.forget_identification()
-            raise WrongAmplifier(
-                f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
-                f"{self.line.name}; give each its own: era amp address --serial-number"
-            )
 
     def arm(self, session: int, watchdog: float = WATCHDOG) -> Coroutine[Any, Any, Values]:
         """Switch the high voltage on at level zero, and return the status; watchdog [s].
@@ -726,7 +570,8 @@ class Amplifier:
         Identifies the amplifier again, because it may have lost power and returned with other
         limits. A stop or disarm that comes after this call goes first, even before it is awaited.
         """
-        self.arming = self.stops_sent, threads.now() + _ARM_WITHIN
+        self._stops_before_arm = self.stops_sent
+        self._arms_until = threads.now() + _ARM_WITHIN
         return self._arm(session, watchdog)
 
     async def _arm(self, session: int, watchdog: float) -> Values:
@@ -753,9 +598,7 @@ class Amplifier:
             raise
         self.session = session
         self.feeding.watchdog = watchdog
-        self.armed_latch = status["latch"]
-        self.contradictions.restart()
-        self._misachieved = 0
+        self.contradictions.restart(status["latch"])
         self.ledger.forget()
         if status["state"] != ENABLED:
             raise _disarmed(self.name, status)
@@ -774,15 +617,13 @@ class Amplifier:
         problem = achieved_problem(layer, reply, can, is_exact=False, slack=_WIRE_ROUNDING)
         achieved = achieved_layer(layer, reply, can)
         if problem is None:
-            self._misachieved = 0
+            self.contradictions.note_achieved(None)
             self.ledger.correct(layer, achieved, token)
             return achieved
-        self._misachieved += 1
-        if self._misachieved >= MAX_CONTRADICTIONS:
-            _, quantity, must, got = problem
-            raise _contradicted(
-                self.name, f"{quantity} in layer {layer.layer} must be {must}, got {got}"
-            )
+        _, quantity, must, got = problem
+        self.contradictions.note_achieved(
+            f"{quantity} in layer {layer.layer} must be {must}, got {got}"
+        )
         return achieved
 
     async def silence(self, ramp: float) -> Values:
@@ -803,7 +644,7 @@ class Amplifier:
         while status["state"] in _ENERGISED or not self.is_silent(status):
             if threads.now() > end or status["state"] == ENABLED:
                 raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")
-            await asyncio.sleep(_INTERVAL)
+            await asyncio.sleep(CONFIRM_INTERVAL)
             status = await self.read_status(Priority.SILENCE)
         self.may_be_armed = False
 
@@ -836,7 +677,7 @@ class Amplifier:
         latch = status["latch"] if has_restarted else last_latch
         if self.stops_sent != last_stops_sent:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-        self.stop_outcome = replace(self.stop_outcome, is_confirmed=False)
+        self.playback_bound.note_cleared()
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)
 
     def stop(
@@ -849,51 +690,26 @@ class Amplifier:
         cancelled.
         """
         stop = self._stop
-        if stop is None or stop.is_sent or stop.result.done():
+        if stop is None or stop.is_sent or stop.outcome.done():
             members = len(self.line.members)
             wire_ramp = self.wire_ramp(ramp)
             # On a shared line each amplifier has three exchanges: a stop and two statuses.
             timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
             timeout += _RAMP.from_wire(wire_ramp)
-            ends = threads.now() + timeout * (members + 1)  # others may keep the line busy
-            stop = PendingStop(wire_ramp, timeout, ends)
+            ends_at = threads.now() + timeout * (members + 1)  # others may keep the line busy
+            stop = PendingStop(self, wire_ramp, timeout, ends_at)
             self._stop = stop
-            stop.result = asyncio.ensure_future(self._confirm_stop(stop))
-            with contextlib.suppress(Exception):  # then `_confirm_stop` makes the request
-                stop.requested = self._request_stop(stop)
-        return asyncio.shield(stop.result)
+            stop.outcome = asyncio.ensure_future(self._outcome_of(stop))
+            with contextlib.suppress(Exception):  # then `PendingStop.repeat` makes the request
+                stop.queue()
+        return asyncio.shield(stop.outcome)
 
-    def _request_stop(self, stop: PendingStop) -> "asyncio.Future[Values]":
-        stop.latch = self.latch
-        return self.line.submit(self, Priority.STOP, "Stop", stop.sent)
-
-    async def _confirm_stop(self, stop: PendingStop) -> StopOutcome:
-        """Repeat a stop until its silence is confirmed, or its timeout has passed.
-
-        A status confirms it if its state is latched, its latch is newer than each one seen before,
-        and the levels of all channels are zero. Any other status may be old and only late.
-        """
-        cause = ""
-        pause = _RAMP.from_wire(stop.ramp) + _INTERVAL
-        try:
-            async with asyncio.timeout_at(stop.ends) as stop.limit:
-                while self.line.loss is None:
-                    try:
-                        request = stop.requested
-                        stop.requested = None
-                        status = await (request or self._request_stop(stop))
-                        while _is_stopping(status, stop.latch):
-                            if self.is_silent(status):
-                                self.stop_outcome = StopOutcome(True, threads.now())
-                                return self.stop_outcome
-                            await asyncio.sleep(_INTERVAL)
-                            status = await self.read_status(Priority.STOP)
-                    except Exception as error:  # the stop continues after any failure
-                        cause = str(error) or type(error).__name__
-                    await asyncio.sleep(pause)
-        except TimeoutError:
-            cause = cause or f"silence was not reported within {stop.timeout:g} s"
-        return self.what_may_play(self.line.loss or cause)
+    async def _outcome_of(self, stop: PendingStop) -> StopOutcome:
+        """Repeat a stop until it is confirmed or has failed, and return what may play then."""
+        cause = await stop.repeat()
+        if stop.is_confirmed:
+            self.playback_bound.note_stopped(threads.now())
+        return self.what_may_play(cause, stop)
 
     async def request(
         self,
@@ -920,35 +736,8 @@ class Amplifier:
             status = await self.read_status()
             self.check_other_host()
             if status["watchdog_left"] > left:
-                raise _driven_by_another(self.name)
+                raise driven_by_another(self.name)
             left = status["watchdog_left"]
-
-
-def _word_count(layers: Sequence[AmplifierLayer]) -> int:
-    """Return how many words layers have on the wire."""
-    words = LAYER.words * len(layers)
-    for layer in layers:
-        words += COMMAND.words * len(layer.tones)
-        for tone in layer.tones:
-            for envelope in (tone.onset, tone.ending):
-                if envelope is not None:
-                    words += ENVELOPE.words + KNOT.words * len(envelope.knots)
-    return words
-
-
-def _is_stopping(status: Values, last_latch: int | None) -> bool:
-    """Whether a status shows a stop that was carried out after this latch was the newest."""
-    if last_latch is None or status["state"] not in LATCHED:
-        return False
-    return status["latch"] > 0 and is_newer_token(status["latch"], last_latch)
-
-
-def _contradicted(name: str, problem: str) -> CommandRefused:
-    """Return the error of an amplifier that contradicts its requests again and again."""
-    return CommandRefused(
-        f"amplifier {name} contradicts its requests: {problem}; look for a derated or broken "
-        "channel, an exchanged cable or firmware, then clear and arm again"
-    )
 
 
 def _disarmed(name: str, status: Values) -> CommandRefused:
@@ -961,8 +750,3 @@ def _disarmed(name: str, status: Values) -> CommandRefused:
         f"{name_of(FAULTS, status['fault'])}; once the cause is gone, clear and arm again",
         is_disarmed=True,
     )
-
-
-def _driven_by_another(name: str) -> WrongAmplifier:
-    """Return the error of an amplifier that another host drives."""
-    return WrongAmplifier(f"amplifier {name} is driven by another host; end that one first")

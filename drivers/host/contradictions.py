@@ -1,17 +1,30 @@
-"""Statuses of an amplifier that contradict the requests sent to it, counted in a row.
+"""Statuses of an amplifier, compared with the requests that were sent to it.
 
-What contradicts the requests is decided by `Amplifier`; when that is a fault, here.
+A single contradiction may be a moment between two sets; several in a row are a fault.
 """
 
 import math
 
+from drivers.errors import CommandRefused
+from drivers.host.clock import HeldClock, armed_problem
+from drivers.host.ledger import Ledger
+from drivers.host.watchdog import Feeding
+from drivers.protocol.definition import MAX_AHEAD, QUANTITIES
+from drivers.protocol.records import Values
+
 MAX_CONTRADICTIONS = 2
-"""So many contradictions in a row are a fault; a single one may be a moment between two sets."""
+"""So many contradictions in a row are a fault."""
+MAX_START_ERROR = 0.003
+"""If a start is known worse than this [s], statuses are not compared."""
 _SAME_MOMENT = 0.01  # s; contradictions of statuses closer to each other than this count once
+_LEFT = QUANTITIES["watchdog_left"]
 
 
 class StatusContradictions:
-    """The contradictory statuses of one amplifier in a row."""
+    """Compares the statuses of an armed amplifier, and counts contradictions in a row.
+
+    name: of the amplifier, for messages.
+    """
 
     count: int = 0
     """Number of contradictory statuses in a row."""
@@ -19,12 +32,72 @@ class StatusContradictions:
     """When the last contradictory status came [s]."""
     _was_unfed: bool = False
     """Whether the last contradiction was in a status that does not feed."""
+    _misachieved: int = 0
+    """Number of contradictory achieved layers in a row."""
+    _armed_latch: int | None = None
+    """Latch in the reply to the last Arm."""
+    _may_wait_until: float = -math.inf
+    """Latest start of the last set with a poor clock [s]."""
+    _is_start_known: bool = True
+    """Whether that start is known well enough to compare statuses."""
 
-    def restart(self) -> None:
-        """Count from zero again, because the amplifier was armed."""
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def restart(self, latch: int) -> None:
+        """Count from zero again, because the amplifier was armed; latch: in the reply."""
         self.count = 0
+        self._misachieved = 0
+        self._armed_latch = latch
 
-    def note_agreement(self, *, shows_watchdog: bool) -> None:
+    def note_commit(self, now: float, start_error: float) -> None:
+        """Note a commit that is sent now; start_error: error of its start [s]."""
+        self._is_start_known = start_error <= MAX_START_ERROR
+        self._may_wait_until = now + MAX_AHEAD
+
+    def note_immediate_start(self) -> None:
+        """Note a set that starts when it arrives."""
+        self._may_wait_until = -math.inf
+
+    def compare(
+        self,
+        status: Values,
+        sent_at: float,
+        now: float,
+        *,
+        is_fed: bool,
+        ledger: Ledger,
+        feeding: Feeding,
+        clock: HeldClock,
+    ) -> None:
+        """Compare a status, received now, with the requests sent before it.
+
+        sent_at: when the request for it went out [s]. is_fed: whether that request feeds the
+        watchdog. Raises CommandRefused for the second contradiction in a row.
+        """
+        problem = armed_problem(status, self._armed_latch)
+        if problem is None and not is_fed:
+            left = status["watchdog_left"] / _LEFT.per_unit
+            problem = feeding.problem(left, sent_at, now)
+        if problem is None:
+            problem = ledger.problem_of(status, sent_at, now)
+            if problem is not None and self._may_wait(sent_at, now, clock):
+                problem = None
+        if problem is None:
+            # The reply to a request that feeds does not show how the watchdog runs down.
+            self._note_agreement(shows_watchdog=not is_fed and feeding.tells(sent_at))
+        elif self._is_fault(now, is_fed=is_fed):
+            raise contradicted(self._name, problem)
+
+    def _may_wait(self, sent_at: float, now: float, clock: HeldClock) -> bool:
+        """Whether the last set may wait although it was committed: its clock is not synchronised.
+
+        sent_at: when the request for the status went out [s].
+        """
+        is_synchronised = self._is_start_known and clock.error(now) < math.inf
+        return sent_at < self._may_wait_until and not is_synchronised
+
+    def _note_agreement(self, *, shows_watchdog: bool) -> None:
         """Note a status without contradiction, which ends the row.
 
         shows_watchdog: whether the status shows how the watchdog runs down. Only such a status ends
@@ -34,14 +107,31 @@ class StatusContradictions:
             self.count = 0
             self._last_at = -math.inf
 
-    def note_contradiction(self, now: float, *, is_fed: bool) -> bool:
-        """Note a contradictory status that came now [s]; return whether the row is a fault.
-
-        is_fed: whether the request for the status feeds the watchdog.
-        """
+    def _is_fault(self, now: float, *, is_fed: bool) -> bool:
+        """Count a contradictory status that came now [s]; return whether the row is a fault."""
         self._was_unfed = not is_fed
         if now - self._last_at < _SAME_MOMENT:
             return False
         self.count += 1
         self._last_at = now
         return self.count >= MAX_CONTRADICTIONS
+
+    def note_achieved(self, problem: str | None) -> None:
+        """Note how an amplifier has achieved a layer; problem: the contradiction, if any.
+
+        Raises CommandRefused for the second contradictory set in a row.
+        """
+        if problem is None:
+            self._misachieved = 0
+            return
+        self._misachieved += 1
+        if self._misachieved >= MAX_CONTRADICTIONS:
+            raise contradicted(self._name, problem)
+
+
+def contradicted(name: str, problem: str) -> CommandRefused:
+    """Return the error of an amplifier that contradicts its requests again and again."""
+    return CommandRefused(
+        f"amplifier {name} contradicts its requests: {problem}; look for a derated or broken "
+        "channel, an exchanged cable or firmware, then clear and arm again"
+    )

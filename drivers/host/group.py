@@ -21,14 +21,15 @@ from drivers.errors import (
     LinkTimeout,
     Preempted,
 )
-from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier, IsPreempted
+from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.group_clocks import Clocks
 from drivers.host.group_states import REACTIONS, Failure, GroupState
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.joint_sets import JointSets, PlayedSet, UnplayedSet
-from drivers.host.ledger import StopOutcome
 from drivers.host.members import Members, is_lost, outcomes
 from drivers.host.requests import Priority
+from drivers.host.set_admission import IsPreempted
+from drivers.host.stops import StopOutcome
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, QUANTITIES, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values

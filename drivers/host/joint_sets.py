@@ -20,12 +20,13 @@ from functools import partial
 from typing import TypeAlias
 
 from drivers.errors import CommandRefused, Overtaken, Preempted
-from drivers.host.amplifier import COMMITTING, Amplifier, IsPreempted
+from drivers.host.amplifier import COMMITTING, Amplifier
 from drivers.host.group_states import Failure
 from drivers.host.ledger import StagedSet, is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, last_fed_at, outcomes
 from drivers.host.requests import Priority
+from drivers.host.set_admission import IsPreempted
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     AHEAD_MAX,

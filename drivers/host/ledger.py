@@ -1,20 +1,19 @@
-"""The ledger of an amplifier (sets sent, confirmed and possibly playing), its watchdog and stops.
+"""The ledger of an amplifier: the sets sent, confirmed and possibly playing.
 
 Only the ledger makes the sets sent over the wire. It checks a set when its turn on the line comes,
 with the rounding of the wire, together with the current playback. A set sent but not yet confirmed
-is a doubt: until it is resolved, only silence is admitted. `Feeding` tracks when the watchdog was
-fed, and when it must have silenced the amplifier. All times [s] refer to one arbitrary clock.
+is a doubt: until it is resolved, only silence is admitted. All times [s] refer to one arbitrary
+clock.
 """
 
-import asyncio
 import logging
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from drivers.errors import CommandRefused, WrongAmplifier
+from drivers.errors import CommandRefused
 from drivers.host.bounds import (
     COMMIT_DELAY,
     TOLERANCE,
@@ -27,16 +26,9 @@ from drivers.host.bounds import (
     wire_limits,
 )
 from drivers.playing import AmplifierLayer, Playback
-from drivers.protocol.definition import (
-    QUANTITIES,
-    REACTION,
-    VERSION,
-    capability_ranges,
-    has_feature,
-)
-from drivers.protocol.records import Values, bits_of
+from drivers.protocol.definition import QUANTITIES, has_feature
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
-from registry import threads
 from registry.limits import GuardLimits
 
 _LEVEL = QUANTITIES["level"]
@@ -47,104 +39,6 @@ _STEPS = 2  # tolerance of levels in a status, in steps
 _MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, as a share of a weak level
 _logger = logging.getLogger(__name__)
-
-SILENCING_TIME = 0.005 + REACTION
-"""Longest time from the expiry of a watchdog until the outputs are silent [s]."""
-_FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
-
-
-@dataclass
-class Feeding:
-    """When the watchdog of an amplifier was fed: by requests that may have, and that surely have.
-
-    Times are in s.
-    """
-
-    delay: float = 0.0
-    """How late a request may arrive on the wire."""
-    is_kept: bool = False
-    """Whether an adapter on the wire may keep requests and deliver them later."""
-    watchdog: float = 0.0
-    """Time of the watchdog."""
-    may: float = -math.inf
-    """When the last request that may have fed the watchdog went out."""
-    plays: float = -math.inf
-    """When the last such request went out that does not also silence the amplifier."""
-    arrives: float = -math.inf
-    """When that request arrives, unless it is delayed."""
-    fade: float = 0.0
-    """Longest ramp of a stop, a disarm or an unanswered silence since then."""
-    since: float = -math.inf
-    """When the last request that surely fed the watchdog went out."""
-    confirmed_at: float = -math.inf
-    """When the reply to that request came."""
-
-    @property
-    def lost_from(self) -> float:
-        """Time [s] when a mute amplifier must be silent due to its watchdog, and is lost.
-
-        A request without reply may still be under way. A request with a reply arrived before that
-        reply, but possibly later than the line takes, because a busy machine may have delayed it.
-        """
-        is_confirmed = self.plays <= self.since
-        arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
-        return arrival + self.watchdog + self.fade + SILENCING_TIME
-
-    @property
-    def may_play_until(self) -> float:
-        """Time [s] when the watchdog must have silenced it, even after a buffered request.
-
-        An adapter may deliver buffered requests at any time; after the watchdog has expired, they
-        have no effect. Of several attempts without reply, one may have arrived and the next one may
-        be buffered.
-        """
-        may_be_fed_again = self.is_kept and self.plays > self.since
-        return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
-
-    def tells(self, sent_at: float) -> bool:
-        """Whether a status requested at a time [s] shows if the watchdog is running down."""
-        return self.may <= self.since and sent_at - self.confirmed_at > REACTION
-
-    def problem(self, left: float, sent_at: float, now: float) -> str | None:
-        """Describe an impossible remaining watchdog time [s] in a status; None if it is possible.
-
-        sent_at: when the request for the status went out, which does not feed; now: when the status
-        came.
-        """
-        lowest = self.watchdog - (now - self.since) - REACTION
-        # An unconfirmed request that may have fed may have arrived just before this one.
-        fed_at = self.confirmed_at if self.may <= self.since else sent_at
-        highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
-        if lowest <= left <= highest:
-            return None
-        return f"watchdog left must be {max(lowest, 0):.3f} to {highest:.3f} s, got {left:.3f} s"
-
-
-@dataclass(frozen=True, slots=True)
-class StopOutcome:
-    """What an amplifier may still play after a stop."""
-
-    is_confirmed: bool
-    """Whether the amplifier has confirmed that it is silent."""
-    may_play_until: float
-    """Until when it may play [s]; infinite if nothing is known to silence it."""
-    cause: str = ""
-    """Why no more is known."""
-
-    def rows(self, now: float) -> dict[str, Any]:
-        """Return the API fields `silence`, `may_play_for_s` and `cause`; now [s]."""
-        left = self.may_play_until - now
-        silence = "may_play" if left > 0 else "watchdog_elapsed"
-        is_bounded = not self.is_confirmed and left < math.inf
-        return {
-            "silence": "confirmed_silent" if self.is_confirmed else silence,
-            "may_play_for_s": round(max(left, 0.0), 3) if is_bounded else None,
-            "cause": self.cause,
-        }
-
-
-UNREACHED = StopOutcome(False, math.inf, "it has not replied since the start")
-"""State of an amplifier before its first reply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,72 +52,6 @@ class StagedSet:
     """Whether the amplifier plays exactly these integers, without further rounding."""
     until: float
     """Deadline of its commit [s]."""
-
-
-@dataclass(eq=False, slots=True)
-class PendingStop:
-    """A stop, which is repeated until the amplifier has confirmed it or a timeout has passed."""
-
-    ramp: int
-    """In units of the wire."""
-    timeout: float
-    """Time for which it is repeated after the first request [s]."""
-    ends: float
-    """Time of the timeout [s]."""
-    is_sent: bool = False
-    """Whether the first request has been sent; later playback needs another stop."""
-    limit: asyncio.Timeout | None = None
-    requested: "asyncio.Future[Values] | None" = None
-    """The first request, queued as soon as the stop is requested."""
-    latch: int | None = None
-    """The newest latch that was known when the last request was made."""
-    result: "asyncio.Future[StopOutcome]" = field(init=False)
-
-    def sent(self) -> list[Values]:
-        """Return the values of the request, and note that it goes out now."""
-        if not self.is_sent:
-            self.is_sent = True
-            self.ends = threads.now() + self.timeout
-            if self.limit is not None:
-                self.limit.reschedule(self.ends)
-        return [{"ramp": self.ramp}]
-
-
-def check_identity(identity: Values, name: str, serial_number: str | None) -> None:
-    """Raise LinkError unless an amplifier speaks this version and has the expected serial number.
-
-    name: of the amplifier, for the message. serial_number: None for any.
-    """
-    if not identity["versions"] >> VERSION & 1:  # bit n: version n
-        spoken = map(str, bits_of(identity["versions"]))
-        raise WrongAmplifier(
-            f"amplifier {name} speaks protocol {', '.join(spoken) or 'none'}, needs {VERSION}; "
-            "update it"
-        )
-    serial = identity["serial_number"]
-    if serial_number not in (None, serial):
-        raise WrongAmplifier(
-            f"amplifier {name}: serial number must be {serial_number}, got {serial}; connect the "
-            "expected amplifier, or restart with this one"
-        )
-
-
-def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> None:
-    """Raise LinkError for capabilities that no amplifier can have, or that contradict the rig.
-
-    is_output: see `Amplifier`; None also without a rig.
-    """
-    for capability, low, stated, high in capability_ranges(can):
-        if not low <= stated <= high:
-            raise WrongAmplifier(
-                f"amplifier {name}: {capability} must be {low} to {high}, got {stated}"
-            )
-    has_output = has_feature(can, "output")
-    if is_output is not None and has_output is not is_output:
-        raise WrongAmplifier(
-            f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "
-            f"got {_FULL_LEVEL[has_output]}; correct the rig file, or connect another amplifier"
-        )
 
 
 class Doubt(NamedTuple):

@@ -11,9 +11,9 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.ledger import StopOutcome
 from drivers.host.line import Line
 from drivers.host.requests import Priority
+from drivers.host.stops import StopOutcome
 from drivers.protocol.records import Values
 from registry import threads
 

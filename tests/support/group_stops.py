@@ -26,8 +26,9 @@ import sim
 from drivers.by_hand import actions
 from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
 from drivers.host.group import Group
-from drivers.host.ledger import SILENCING_TIME, StopOutcome
 from drivers.host.requests import Priority
+from drivers.host.stops import StopOutcome
+from drivers.host.watchdog import SILENCING_TIME
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES
 from drivers.protocol.sets import Envelope

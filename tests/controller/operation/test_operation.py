@@ -30,7 +30,7 @@ from controller.operation.operation_states import (
 )
 from controller.operation.plate_controller import Controller
 from drivers.errors import CommandRefused, DriverError
-from drivers.host.ledger import StopOutcome
+from drivers.host.stops import StopOutcome
 from drivers.protocol.definition import FAULTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after

@@ -23,8 +23,9 @@ from drivers.by_hand.actions import read_electrical
 from drivers.errors import LinkTimeout
 from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
-from drivers.host.ledger import Ledger, StopOutcome
+from drivers.host.ledger import Ledger
 from drivers.host.requests import Priority
+from drivers.host.stops import StopOutcome
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values

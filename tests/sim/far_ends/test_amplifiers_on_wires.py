@@ -23,8 +23,8 @@ from cases import shortly
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
-from drivers.host.ledger import StopOutcome
 from drivers.host.line import Line
+from drivers.host.stops import StopOutcome
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (

@@ -1,6 +1,7 @@
 """The table of checks on docs/reference/conformance.md, from `era_haptics.lab.conformance`."""
 
-from era_haptics.lab.conformance.contract import CHECKS, ConformanceCheck
+from era_haptics.lab.conformance.check import ConformanceCheck
+from era_haptics.lab.conformance.contract import CHECKS
 
 _WIRES = {"serial": "serial", "rtu": "Modbus RTU", "tcp": "Modbus TCP", "can": "CAN"}
 

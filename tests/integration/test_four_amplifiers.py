@@ -47,7 +47,7 @@ from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group_states import GroupState
 from era_haptics.command import run_era
-from era_haptics.lab.conformance.contract import opened
+from era_haptics.lab.conformance.connection import opened
 from kit.chain import Chain
 from kit.clock import in_virtual_time
 from kit.fingers import write_schedule

@@ -3,19 +3,19 @@
 import json
 import shlex
 import sys
-import textwrap
+from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from drivers.by_hand.cli import EXIT_STATUS, Json, Trace, Url, run
-from drivers.errors import LinkError
+from drivers.errors import CommandError, LinkError
 
 if TYPE_CHECKING:
-    from era_haptics.lab.conformance.contract import CheckResult
+    from era_haptics.lab.conformance.report import CheckResult, ConformanceReport
 
 _INDENT = " " * 9
-_WIDTH = 100
 
 
 def conformance(
@@ -33,55 +33,97 @@ def conformance(
             help="Drive level of the channels, relative to full level. Default: 0.2.",
         ),
     ] = None,
+    keyword: Annotated[
+        str,
+        typer.Option(
+            "-k",
+            metavar="EXPRESSION",
+            show_default=False,
+            help="Run only checks whose names match, such as 'watchdog or stop'.",
+        ),
+    ] = "",
+    junit_xml: Annotated[
+        Path | None,
+        typer.Option(
+            "--junitxml",
+            metavar="FILE",
+            dir_okay=False,
+            show_default=False,
+            help="Write a JUnit report to FILE.",
+        ),
+    ] = None,
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
     """Check that an amplifier conforms to the protocol. Reads only, unless --write is given."""
     from drivers.by_hand.actions import leave
-    from era_haptics.lab.conformance.contract import DEFAULT_LEVEL, judge
+    from drivers.trace import tracing
+    from era_haptics.lab.conformance.session import DEFAULT_LEVEL, judge
 
     level = DEFAULT_LEVEL if level is None else level
-    show = (lambda result: None) if json_ else _show_result
-    report = run(judge(url, drives=False, level=level, on_result=show), trace)
-    if not write and not json_ and sys.stdin.isatty():
-        write = typer.confirm(
-            f"{report.left} more checks arm the amplifier and drive its channels at {level:.0%} of "
-            "full level. If another amplifier on the line replies, checks of broadcasts are "
-            "skipped. Continue?"
-        )
-    if write:
-        more = judge(url, drives=True, level=level, on_result=show, before=report)
+    if junit_xml is not None:
+        _require_writable(junit_xml)
+    is_driven = False
+
+    def may_drive(count: int) -> bool:
+        nonlocal is_driven
+        is_interactive = not json_ and sys.stdin.isatty()
+        is_driven = write or (is_interactive and _confirms(count, level))
+        return is_driven
+
+    with nullcontext() if trace is None else tracing(trace):
         try:
-            report = run(more, trace)
+            report = judge(
+                url,
+                level=level,
+                may_drive=may_drive,
+                on_result=(lambda result: None) if json_ else _show_result,
+                keyword=keyword,
+                junit_xml=junit_xml,
+            )
         except (KeyboardInterrupt, LinkError):
-            print(f"era: run ended early: {run(leave(url), None)}", file=sys.stderr)
+            if is_driven:
+                print(f"era: run ended early: {run(leave(url), None)}", file=sys.stderr)
             raise
     if json_:
         print(json.dumps(report.to_json()))
     else:
-        if report.fix_first:
-            print(f"Fix first: {'; '.join(report.fix_first)}")
-        print(report.summary)
-        if report.left and report.overall != "failed":
-            print(f"Next: era amp conformance {shlex.quote(url)} --write")
+        _show_summary(report)
     if report.overall == "failed":
         raise typer.Exit(1)
-    if write and report.overall == "incomplete":
+    if is_driven and report.overall == "incomplete":
         raise typer.Exit(EXIT_STATUS[LinkError])
+
+
+def _require_writable(path: Path) -> None:
+    """Raise CommandError if a file cannot be written."""
+    try:
+        path.touch()
+    except OSError as error:
+        raise CommandError(f"JUnit report {path} cannot be written: {error.strerror}") from error
+
+
+def _confirms(count: int, level: float) -> bool:
+    """Ask the user whether checks may drive the channels."""
+    return typer.confirm(
+        f"{count} more checks arm the amplifier and drive its channels at {level:.0%} of "
+        "full level. If another amplifier on the line replies, checks of broadcasts are "
+        "skipped. Continue?"
+    )
 
 
 def _show_result(result: "CheckResult") -> None:
     mark = result.result.value.replace("_", " ")
-    is_failed = mark == "failed"
-    print(f"{mark.upper() if is_failed else mark:<7}  {result.check.title}")
-    if result.reason:
-        print(f"{_INDENT}{result.reason}")
-    if is_failed:
-        place, remedy = result.advice
-        text = f"remedy: {remedy}"
-        print(f"{_INDENT}rule: docs/reference/{place} (check {result.check.name})")
-        print(textwrap.fill(text, _WIDTH, initial_indent=_INDENT, subsequent_indent=_INDENT))
-    if result.finding.sent:
-        print(f"{_INDENT}last set sent: {result.finding.sent}")
-    if result.finding.came:
-        print(f"{_INDENT}last bytes received: {result.finding.came}")
+    if mark == "failed":
+        mark = mark.upper()
+    print(f"{mark:<7}  {result.check.title}")
+    for line in result.details:
+        print(f"{_INDENT}{line}")
+
+
+def _show_summary(report: "ConformanceReport") -> None:
+    if report.fix_first:
+        print(f"Fix first: {'; '.join(report.fix_first)}")
+    print(report.summary)
+    if report.remaining and report.overall != "failed":
+        print(f"Next: era amp conformance {shlex.quote(report.url)} --write")

@@ -9,11 +9,12 @@ import json
 import math
 import re
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
@@ -41,7 +42,7 @@ from drivers.urls import (
 )
 from drivers.wires.wire import schemes
 from era_haptics.lab.cli import app as lab_app
-from era_haptics.lab.conformance.check import ConformanceReport
+from era_haptics.lab.conformance.report import ConformanceReport
 from kit.wires import WORD_WIRES, WordFarSide
 from model.rig.rig_file import example_rig_path
 from processes.patient_daemon import LONG_WATCHDOG, wait_long
@@ -422,6 +423,35 @@ def test_conformance_reads_first_and_reports_what_is_left() -> None:
     assert shown.stdout.splitlines()[-1] == f"Next: era amp conformance '{URL}' --write"
 
 
+def test_conformance_runs_selected_checks_and_writes_a_junit_report(tmp_path: Path) -> None:
+    """Two checks match; the one that drives is left out, and skipped in the report."""
+    junit_xml = tmp_path / "conformance.xml"
+    options = ("-k", "identity or stop_ramps", "--junitxml", str(junit_xml))
+    report = result_of("conformance", URL, *options)
+    assert [(row["name"], row["result"]) for row in report["checks"]] == [("identity", "passed")]
+    assert report["not_run"] == 1
+    (suite,) = ElementTree.parse(junit_xml).getroot()
+    cases = {case.get("name"): [child.tag for child in case] for case in suite}
+    assert cases == {"identity": [], "stop_ramps": ["skipped"]}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("-k", "identity or"), "-k must be an expression of check names, got 'identity or'"),
+        (("-k", "idendity"), "-k must be an expression of check names, got 'idendity': no check"),
+        (("--junitxml", "/no-such-folder/report.xml"), "JUnit report /no-such-folder/report.xml"),
+    ],
+)
+def test_conformance_rejects_wrong_options_before_any_check(
+    options: tuple[str, str], message: str
+) -> None:
+    """The message names the option and its value."""
+    error = invoke("conformance", URL, *options).exception
+    assert isinstance(error, CommandError)
+    assert str(error).startswith(message)
+
+
 @pytest.mark.real_time
 async def test_conformance_stops_after_a_failed_reading_check() -> None:
     """An amplifier that is armed already: exit status 1, nothing is driven, nor advised."""
@@ -447,15 +477,16 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
     """By Ctrl-C, or a line that was lost and is there again: stopped, cleared, its state told."""
     async with WORD_WIRES["serial"](1) as far:
 
-        async def judged(url: str, *, drives: bool, **others: Any) -> ConformanceReport:
-            if drives:
-                far.amplifiers[1].handle(
-                    "Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic()
-                )
-                raise end
-            return ConformanceReport(url, 0.0, (), 1)
+        def judged(
+            url: str, *, may_drive: Callable[[int], bool], **options: Any
+        ) -> ConformanceReport:
+            assert may_drive(1)
+            far.amplifiers[1].handle(
+                "Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic()
+            )
+            raise end
 
-        monkeypatch.setattr("era_haptics.lab.conformance.contract.judge", judged)
+        monkeypatch.setattr("era_haptics.lab.conformance.session.judge", judged)
         result = await asyncio.to_thread(invoke, "conformance", far.url(1), "--write")
         assert result.exit_code != 0
         assert f"{far.url(1)} is left in SWITCH_ON_DISABLED" in result.stderr

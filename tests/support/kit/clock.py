@@ -14,6 +14,7 @@ import random
 import threading
 from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar
@@ -32,9 +33,10 @@ from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_frames import FrameReader
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
-from era_haptics.lab.conformance.check import run_checks
-from era_haptics.lab.conformance.contract import CHECKS, DEFAULT_LEVEL, CheckResult, of_kind
-from era_haptics.lab.conformance.contract import CLIENTS as BY_PROTOCOL
+from era_haptics.lab.conformance.connection import CLIENTS as BY_PROTOCOL
+from era_haptics.lab.conformance.contract import CHECKS, of_kind
+from era_haptics.lab.conformance.report import CheckResult
+from era_haptics.lab.conformance.session import DEFAULT_LEVEL, CheckSession
 from registry import threads
 from registry.limits import GuardLimits
 from registry.virtual_time import VirtualTimeLoop
@@ -756,24 +758,6 @@ def short_checks(kind: str) -> list[str]:
     return [name for name in names if name not in serial or name in _OF_EVERY_WIRE]
 
 
-async def results_of(
-    kind: str,
-    far: Judged,
-    names: Sequence[str] = (),
-    *,
-    level: float = DEFAULT_LEVEL,
-    on_result: Callable[[CheckResult], None] = lambda result: None,
-    neighbours: Mapping[int, SimulatedAmplifier] | None = None,
-) -> list[CheckResult]:
-    """Results of checks by name, all without names, on an amplifier on a kind of wire."""
-    line = JudgedLine(kind, far, neighbours)
-    chosen = [each for each in of_kind(kind) if not names or each[1].name in names]
-    try:
-        return [*await run_checks(chosen, line.client, level=level, on_result=on_result)]
-    finally:
-        line.close()
-
-
 def judged(
     kind: str,
     names: Sequence[str] = (),
@@ -783,10 +767,23 @@ def judged(
     on_result: Callable[[CheckResult], None] = lambda result: None,
     neighbours: Mapping[int, SimulatedAmplifier] | None = None,
 ) -> list[CheckResult]:
-    """Results on an amplifier, a `varied` one if none is given, in virtual time."""
+    """Results of checks by name, all without names, in virtual time.
+
+    far: the amplifier, a `varied` one if none is given.
+    """
     unknown = set(names) - {check.name for check in CHECKS}
     assert not unknown, unknown
-    far = far or varied()
-    return run_virtual(
-        results_of(kind, far, names, level=level, on_result=on_result, neighbours=neighbours)
-    )
+    checks = [
+        (number, check) for number, check in of_kind(kind) if not names or check.name in names
+    ]
+
+    async def connected() -> JudgedLine:
+        return JudgedLine(kind, far or varied(), neighbours)
+
+    with (
+        asyncio.Runner(loop_factory=VirtualLoop) as runner,
+        closing(runner.run(connected())) as line,
+    ):
+        session = CheckSession(checks, line.client, runner.run, level=level, on_result=on_result)
+        session.run()
+        return session.results

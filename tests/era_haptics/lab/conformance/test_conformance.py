@@ -17,29 +17,24 @@ from cobs import cobs
 
 import era_haptics
 from cases import shortly
-from drivers.errors import CommandError
+from drivers.errors import CommandError, LinkError
 from drivers.protocol.definition import REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.trace import tracing
 from drivers.wires.can_frames import unpack_frames
 from drivers.wires.serial_frames import FrameReader
-from era_haptics.lab.conformance.check import (
-    CheckResult,
-    ConformanceCheck,
-    ConformanceReport,
-    in_words,
-    run_checks,
-)
+from era_haptics.lab.conformance.check import ConformanceCheck
 from era_haptics.lab.conformance.checks import state_checks
-from era_haptics.lab.conformance.contract import CHECKS, Result, judge, of_kind
-from era_haptics.lab.conformance.judge_client import (
-    ContractViolation,
-    Judge,
-    TooLate,
-    When,
-    layer,
-)
+from era_haptics.lab.conformance.contract import CHECKS, of_kind
+from era_haptics.lab.conformance.dating import When
+from era_haptics.lab.conformance.judge import Judge
+from era_haptics.lab.conformance.outcomes import ContractViolation, TooLate
+from era_haptics.lab.conformance.report import CheckResult, ConformanceReport, Result
+from era_haptics.lab.conformance.requests import layer
+from era_haptics.lab.conformance.run import ConformanceRun
+from era_haptics.lab.conformance.session import judge
+from era_haptics.lab.conformance.set_text import set_text
 from era_haptics.lab.conformance.subject import Subject
 from kit.clock import (
     JUDGED_LINE_KINDS,
@@ -94,7 +89,8 @@ def changed(
 def test_simulated_amplifier_passes(kind: str) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind)
-    assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
+    in_order = sorted(of_kind(kind), key=lambda numbered: numbered[1].drives)
+    assert [result.number for result in results] == [number for number, _ in in_order]
     expect_passed(results, SKIPPED[kind])
 
 
@@ -185,6 +181,31 @@ def test_amplifier_with_the_least_of_all_passes(knots: int, names: list[str]) ->
     expect_passed(judged("serial", names, far=far), set() if names else skipped)
 
 
+def test_session_ignores_the_users_pytest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither options and plug-ins of the environment nor a conftest.py are read."""
+    (tmp_path / "conftest.py").write_text("raise RuntimeError", encoding="utf-8")
+    (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --nonsense\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTEST_ADDOPTS", "--nonsense")
+    monkeypatch.setenv("PYTEST_PLUGINS", "no_such_plugin")
+    (result,) = judged("serial", ["identity"])
+    assert result.result is Result.PASSED
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), KeyboardInterrupt(), LinkError("lost")])
+def test_session_raises_errors_that_are_no_verdict(
+    error: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bug, an interruption and a lost line end the run; none counts as a failed check."""
+
+    async def fail(subject: Subject) -> None:
+        raise error
+
+    monkeypatch.setattr(Subject, "watch", fail)
+    with pytest.raises(type(error)):
+        judged("serial", ["identity", "capabilities"])
+
+
 def test_level_below_a_step_is_refused() -> None:
     """An amplifier that has full level alone cannot be driven at a fifth of it."""
     far = _Coarse("coarse", channels=2)
@@ -269,7 +290,7 @@ def _tried(
     stalls: list[float], steps: Callable[[list[float], Subject], Any] = _stalled
 ) -> ConformanceCheck:
     return ConformanceCheck(
-        "stalled", "passes", "", drives=True, kinds=(), run=partial(steps, stalls)
+        "stalled", "passes", "", drives=True, kinds=(), steps=partial(steps, stalls)
     )
 
 
@@ -278,7 +299,7 @@ async def _wrong(stalls: list[float], subject: Subject) -> None:
     if stalls:
         _stall(stalls.pop())
         await asyncio.sleep(0.02)
-        raise ContractViolation("it", expected="right", seen="wrong")
+        raise ContractViolation("it", expected="right", actual="wrong")
 
 
 @pytest.mark.parametrize(
@@ -296,7 +317,7 @@ async def test_check_is_made_again_where_this_program_was_late(
 ) -> None:
     """Its third attempt decides, undisturbed or not: a stall is no fault of the amplifier."""
     with closing(JudgedLine("serial", varied())) as line:
-        (found,) = await run_checks([(1, _tried(stalls, steps))], line.client, level=0.2)
+        found = await ConformanceRun(line.client, 0.2).check(1, _tried(stalls, steps))
     assert (found.result, found.attempts) == (result, 3)
 
 
@@ -306,15 +327,16 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
 
     After 20 s of attempts that came too late no attempt follows, and the reason says so.
     """
-    checks = [(1, _tried([0.11] * 20)), (2, _tried([]))]
     with closing(JudgedLine("serial", varied())) as line:
-        late, good = await run_checks(checks, line.client, level=0.2)
-        line.client.wasted = 20.0
-        (last,) = await run_checks([(1, _tried([0.11]))], line.client, level=0.2)
+        run = ConformanceRun(line.client, 0.2)
+        late = await run.check(1, _tried([0.11] * 20))
+        good = await run.check(2, _tried([]))
+        line.client.lateness.wasted = 20.0
+        last = await run.check(1, _tried([0.11]))
     assert (late.result, good.result) == ("skipped", "passed")
-    assert isinstance(late.finding, TooLate)
+    assert isinstance(late.outcome, TooLate)
     assert ConformanceReport("x", 0.2, (late, good), 0).overall == "incomplete"
-    assert isinstance(last.finding, TooLate)
+    assert isinstance(last.outcome, TooLate)
     assert last.reason.startswith("no verdict because the time for repetitions is used up: "), (
         last.reason
     )
@@ -351,7 +373,7 @@ def test_shortest_watchdog_is_tried_though_it_cannot_be_fed(
         far.capabilities.update(watchdog_min=100)
         found += judged("serial", ["watchdog_ranges"], far=far)
     assert [each.result for each in found] == ["passed", "failed"], found
-    assert "watchdog" in found[1].finding.seen
+    assert "watchdog" in found[1].outcome.actual
 
 
 def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -359,7 +381,7 @@ def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> Non
     obey_late(monkeypatch, 0.025)
     read, obeyed = judged("serial", ["replies_in_time", "obeys_in_time"])
     assert (read.result, obeyed.result) == ("passed", "failed"), obeyed.reason
-    assert float(obeyed.finding.seen.split(": ")[1]) == pytest.approx(25, abs=0.5)  # ms
+    assert float(obeyed.outcome.actual.split(": ")[1]) == pytest.approx(25, abs=0.5)  # ms
 
 
 TIMED = ["obeys_in_time", "watchdog", "valid_for", "after", "ramps", "onsets", "phases", "voices"]
@@ -443,7 +465,7 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     loop.add_reader(far, lambda: end.receive(os.read(far, 4096), threads.now()))
     url = f"serial://{os.ttyname(near)}"
     with tracing(tmp_path / "trace"):
-        report = await judge(url, drives=False)
+        report = await asyncio.to_thread(judge, url, may_drive=lambda count: False)
     lines = (tmp_path / "trace").read_text().splitlines()
     assert {">", "<"} <= {word for line in lines for word in line.split()}
     loop.remove_reader(far)
@@ -482,11 +504,11 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
 
 def test_report_says_the_worst() -> None:
     """One that failed makes all fail; a violation says what must be, and what was seen."""
-    found = ContractViolation("latch", expected=3, seen=4)
-    assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
+    found = ContractViolation("latch", expected=3, actual=4)
+    assert (str(found), found.actual) == ("latch must be 3, got 4", "latch: 4")
     for empty in ("", set[int](), b""):
         assert (
-            str(ContractViolation("reply", expected=empty, seen=0)) == "reply must be none, got 0"
+            str(ContractViolation("reply", expected=empty, actual=0)) == "reply must be none, got 0"
         )
     bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
     good = CheckResult(state_checks.stop, 2, Result.PASSED)
@@ -629,7 +651,7 @@ def test_malformed_reply_fails_one_check_with_its_bytes(
     results = judged(kind, names)
     (failed,) = (each for each in results if each.result == "failed")
     shown = b"".join(each.data for each in unpack_frames(bad[0])) if kind == "can" else bad[0]
-    assert shown.hex(" ") in failed.finding.came
+    assert shown.hex(" ") in failed.outcome.last_bytes
     assert [each.result for each in results].count(Result.PASSED) == len(names) - 1, results
 
 
@@ -638,7 +660,7 @@ def test_failure_shows_the_set_that_was_sent() -> None:
     words = [0x2A17, 0x0102, 0x0002, 0x0004, 0x0014, 0x01F4]
     words += [0x0008, 0x0898, 0x07D0, 0x0000, 0x0018, 0x0898, 0x044C, 0xDCD8]
     words += [0x0028, 0x0898, 0x0258, 0x34BC, 0x0038, 0x0898, 0x0190, 0x0802]
-    shown = in_words([words])
+    shown = set_text([words])
     assert shown.startswith("set 258, staged; layer 0, ramp 20 ms, valid for 500 ms: channel 0 ")
     assert "channel 0 110 Hz 0.2 at 0 degrees keep_phase, channel 1 110 Hz 0.11 at -90" in shown
     assert shown.endswith(
@@ -646,7 +668,7 @@ def test_failure_shows_the_set_that_was_sent() -> None:
         "DCD8 0028 0898 0258 34BC 0038 0898 0190 0802"
     )
     (result,) = judged("serial", ["stop"], far=_PlaysOn("loud", channels=2))
-    assert result.finding.sent.startswith(
+    assert result.outcome.last_set.startswith(
         "set 2, staged; layer 0, ramp 0 ms, valid for 0 ms: channel 0 "
     )
 
@@ -659,7 +681,7 @@ def test_one_bad_capability_is_one_failure() -> None:
     results = {each.check.name: each for each in judged("serial", names, far=far)}
     failed = [name for name, each in results.items() if each.result == "failed"]
     assert failed == ["capabilities"]
-    assert "900" in results["capabilities"].finding.expected
+    assert "900" in results["capabilities"].outcome.expected
     not_run = {name for name, each in results.items() if each.result == "not_run"}
     assert not_run == {"onsets", "endings", "voices"}
     assert all("envelope_step_max" in results[name].reason for name in not_run)

@@ -1,0 +1,40 @@
+"""Expected state of the amplifier under test, whose differences are violations of the contract."""
+
+from dataclasses import replace
+from functools import partial
+
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem
+from era_haptics.lab.conformance.outcomes import ContractViolation, require_in_time
+from era_haptics.lab.expected_amplifier import ExpectedAmplifier
+from era_haptics.lab.expected_output import Interval
+
+
+class Judge(ExpectedAmplifier):
+    """Expected state of an amplifier with these capabilities, starting from a status at rest.
+
+    Raises ContractViolation and TooLate.
+    """
+
+    def __init__(self, can: Values, rest: Values, when: Interval) -> None:
+        unclear = partial(require_in_time, False)
+        super().__init__(self._violated, self._violated, unclear=unclear, may_fail=False)
+        self.identified(can)
+        self.check(rest, when)
+
+    def _violated(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
+        raise ContractViolation(what, expected=must, actual=seen)
+
+    def achieved(self, layer_set: LayerSet, reply: Values) -> LayerSet:
+        """Return a layer as achieved according to the reply to GetAchieved.
+
+        Raises ContractViolation if a value differs by more than half a step.
+        """
+        driven = tuple(tone for tone in layer_set.commands if tone.is_driven)
+        layer_set = replace(layer_set, commands=driven)
+        problem = achieved_problem(layer_set, reply, self.can, is_exact=False)
+        if problem:
+            rule, quantity, expected, actual = problem
+            quantity = f"{quantity} in layer {layer_set.layer}"
+            self.report(rule, 0.0, quantity, must=expected, seen=actual)
+        return achieved_layer(layer_set, reply, self.can)

@@ -1,0 +1,75 @@
+"""Lateness of this machine and of replies, which must not count against the amplifier."""
+
+import asyncio
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from drivers.protocol.definition import REACTION
+from registry import threads
+
+FEW = 3
+"""Number of occurrences that exclude chance lateness of this machine."""
+BUSY = 0.02
+"""Lateness of this machine [s] up to which a violation counts when it is seen once."""
+_MAX_ATTEMPTS = 20  # per check with all its cases, if this machine is late
+_MAX_WASTED = 20.0  # s per run, for attempts that came too late
+_INTERVAL = 0.005  # s; between two measurements of this machine's lateness
+
+
+class Lateness:
+    """Lateness during a run of checks.
+
+    attempts: repetitions of the current check because of lateness. wasted: their total time in the
+    run [s]. lag: this machine's largest lateness in an attempt [s]. largest: the largest lateness
+    of this machine or of a reply in the run [s]. reactions: times until a reply began [s], by
+    message name, "refusals" for rejections.
+    """
+
+    def __init__(self) -> None:
+        self.attempts = 0
+        self.wasted = 0.0
+        self.lag = 0.0
+        self.largest = 0.0
+        self.reactions: dict[str, list[float]] = defaultdict(list)
+
+    @property
+    def slow_reply(self) -> str:
+        """Return which message it always answers too late, and by when; empty if none."""
+        for name, reactions in self.reactions.items():
+            shortest = min(reactions, default=0.0)
+            if len(reactions) >= FEW and shortest > REACTION:
+                return f"its replies to {name} begin after at least {1e3 * shortest:.3g} ms"
+        return ""
+
+    @property
+    def is_used_up(self) -> bool:
+        """Return whether the run's time for late attempts is used up."""
+        return self.wasted >= _MAX_WASTED
+
+    def repeats(self, started_at: float) -> bool:
+        """Record an attempt that was late; return whether to repeat it."""
+        if self.slow_reply:
+            return False
+        self.attempts = min(self.attempts + 1, _MAX_ATTEMPTS)
+        self.wasted += threads.now() - started_at
+        return self.attempts < _MAX_ATTEMPTS and not self.is_used_up
+
+    @contextmanager
+    def measured(self) -> Iterator[None]:
+        """Measure this machine's lateness during a check."""
+        self.attempts = 0
+        self.lag = 0.0
+        measuring = asyncio.create_task(self._measure(), name="how late this machine is")
+        try:
+            yield
+        finally:
+            measuring.cancel()
+
+    async def _measure(self) -> None:
+        while True:
+            due = threads.now() + _INTERVAL
+            await asyncio.sleep(_INTERVAL)
+            late_by = threads.now() - due
+            self.lag = max(self.lag, late_by)
+            self.largest = max(self.largest, late_by)

@@ -1,0 +1,72 @@
+"""Requests of a check as rows: which are sent, and which outcomes are allowed."""
+
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+from drivers.protocol.definition import QUANTITIES
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet
+
+FULL = QUANTITIES["level"].per_unit
+"""Steps of a full level."""
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Request from values (with the held session unless another is given) or from raw words.
+
+    layers: of a set, which is sent in parts. codes: allowed outcomes, "" meaning carried out.
+    channels: those that a rejection can name.
+    """
+
+    name: str
+    raw: Sequence[int] | None
+    values: Values
+    layers: tuple[LayerSet, ...]
+    codes: tuple[str, ...]
+    channels: tuple[int | None, ...]
+
+
+Row: TypeAlias = "LayerSet | Send | float | Callable[[], Awaitable[object]] | Sequence[Row]"
+"""A layer to play, a request, a pause [s] with a fed watchdog, an awaitable, or a sequence.
+
+A sequence of rows starts at rest and armed, and is followed until all outputs have settled.
+"""
+RequestRows: TypeAlias = Sequence[Row]
+
+
+def send(
+    name: str,
+    *,
+    raw: Sequence[int] | None = None,
+    code: str | tuple[str, ...] = "",
+    channels: tuple[int | None, ...] = (None,),
+    layers: tuple[LayerSet, ...] = (),
+    **values: Any,
+) -> Send:
+    """Build a request that must be carried out, or rejected with a code."""
+    codes = (code,) if isinstance(code, str) else code
+    return Send(name, raw, values, layers, codes, channels)
+
+
+def play_now(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
+    """Build a set that plays immediately; values: token, session, code, as in `send`."""
+    return send("Set", layers=layers, now=now, **values)
+
+
+stage = partial(play_now, now=0)
+"""Build a set that is staged."""
+
+
+def layer(
+    number: int,
+    *commands: Command,
+    ramp: int = 0,
+    valid_for: int = 0,
+    after: bool = False,
+    renew: bool = False,
+) -> LayerSet:
+    """Build the content of a layer; ramp, valid_for in ms."""
+    return LayerSet(number, ramp, valid_for, commands, after, renew)

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from cases import shortly
+from era_haptics.lab.conformance.conformance_report import Result
 from era_haptics.lab.conformance.contract import CHECKS, of_kind
-from era_haptics.lab.conformance.report import Result
 from kit.clock import JUDGED_LINE_KINDS, judged, plain, short_checks
 from processes.firmware_machine import FirmwareEnd, build_firmware
 

@@ -20,7 +20,7 @@ from drivers.wires.can_frames import (
     segments,
     unpack_frames,
 )
-from era_haptics.lab.conformance.client import HeardMessage, JudgeClient, with_flipped_bit
+from era_haptics.lab.conformance.judge_client import HeardMessage, JudgeClient, with_flipped_bit
 from era_haptics.lab.conformance.outcomes import read_as
 from registry import threads
 

@@ -13,7 +13,7 @@ from drivers.by_hand.cli import EXIT_STATUS, Json, Trace, Url, run
 from drivers.errors import CommandError, LinkError
 
 if TYPE_CHECKING:
-    from era_haptics.lab.conformance.report import CheckResult, ConformanceReport
+    from era_haptics.lab.conformance.conformance_report import CheckResult, ConformanceReport
 
 _INDENT = " " * 9
 

@@ -9,7 +9,7 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.wire import address_of
 from era_haptics.lab.conformance.can_client import CanClient
-from era_haptics.lab.conformance.client import JudgeClient
+from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.modbus_client import ModbusClient
 from era_haptics.lab.conformance.outcomes import ContractViolation, TooLate
 from era_haptics.lab.conformance.serial_client import SerialClient

@@ -27,7 +27,8 @@ from drivers.wires.modbus_frames import (
     unpack_identity,
     write_pdu,
 )
-from era_haptics.lab.conformance.client import (
+from era_haptics.lab.conformance.dating import When
+from era_haptics.lab.conformance.judge_client import (
     GATEWAY_TIMEOUT,
     QUIET_TIME,
     HeardMessage,
@@ -36,7 +37,6 @@ from era_haptics.lab.conformance.client import (
     message_name,
     with_flipped_bit,
 )
-from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.outcomes import expect_equal, read_as, verify
 from registry import threads
 

@@ -9,7 +9,8 @@ from drivers.protocol.definition import MESSAGES, VERSION
 from drivers.protocol.records import Values
 from era_haptics.lab.conformance.capabilities import STATED, Capabilities
 from era_haptics.lab.conformance.check import ConformanceCheck
-from era_haptics.lab.conformance.client import JudgeClient
+from era_haptics.lab.conformance.conformance_report import CheckResult, Result
+from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.lateness import BUSY, FEW
 from era_haptics.lab.conformance.outcomes import (
     AlreadyArmed,
@@ -22,7 +23,6 @@ from era_haptics.lab.conformance.outcomes import (
     read_as,
     verify,
 )
-from era_haptics.lab.conformance.report import CheckResult, Result
 from era_haptics.lab.conformance.requests import FULL
 from era_haptics.lab.conformance.set_text import set_text
 from era_haptics.lab.conformance.subject import Subject

@@ -17,7 +17,7 @@ from drivers.wires.serial_frames import (
     pack_words,
     words_of,
 )
-from era_haptics.lab.conformance.client import HeardMessage, JudgeClient, with_flipped_bit
+from era_haptics.lab.conformance.judge_client import HeardMessage, JudgeClient, with_flipped_bit
 from era_haptics.lab.conformance.outcomes import expect_equal, read_as
 from registry import threads
 

@@ -16,10 +16,10 @@ import pytest
 
 from drivers.errors import CommandError
 from era_haptics.lab.conformance.check import ConformanceCheck
-from era_haptics.lab.conformance.client import JudgeClient
+from era_haptics.lab.conformance.conformance_report import CheckResult, ConformanceReport, Result
 from era_haptics.lab.conformance.connection import opened
 from era_haptics.lab.conformance.contract import of_kind
-from era_haptics.lab.conformance.report import CheckResult, ConformanceReport, Result
+from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.run import ConformanceRun
 
 DEFAULT_LEVEL = 0.2
@@ -94,7 +94,7 @@ class CheckSession:
         self._kind = client.kind
         self._run = ConformanceRun(client, level)
         self._run_in_loop = run_in_loop
-        self._ask_to_drive = may_drive
+        self._drive_permission = may_drive
         self._on_result = on_result
         self._driving_checks = 0  # number of selected checks that drive the channels
         self._end: BaseException | None = None  # what ended the session early
@@ -164,7 +164,7 @@ class CheckSession:
     @cached_property
     def _may_drive(self) -> bool:
         """Whether the channels may be driven."""
-        return self._ask_to_drive(self._driving_checks)
+        return self._drive_permission(self._driving_checks)
 
     def pytest_keyboard_interrupt(self, excinfo: pytest.ExceptionInfo[BaseException]) -> None:
         """Keep what ended the session early: an interruption, or the error of an item."""

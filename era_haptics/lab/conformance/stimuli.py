@@ -12,13 +12,13 @@ from typing import Any
 from drivers.protocol.definition import QUANTITIES, REACTION, has_feature
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.capabilities import Capabilities
-from era_haptics.lab.conformance.client import JudgeClient
+from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.outcomes import require
 from era_haptics.lab.conformance.requests import FULL, Send, layer, play_now
 
 READ_REQUESTS = ("GetCaps", "GetStatus", "GetFaults")
 """Messages that only read: on Modbus each takes half an exchange."""
-_USUAL_FREQUENCY = QUANTITIES["frequency"].to_wire(110.0)
+_DEFAULT_FREQUENCY = QUANTITIES["frequency"].to_wire(110.0)
 _OFFSET = 800  # steps of frequency between the usual and the second one
 _PHASE, _ENVELOPE_STEP = QUANTITIES["phase"], QUANTITIES["envelope_step"]
 _PROMPT = 0.02  # s, exchange time of a fast line
@@ -75,7 +75,7 @@ class Stimuli:
     @cached_property
     def frequency(self) -> int:
         """The usual frequency, in steps."""
-        return min(max(_USUAL_FREQUENCY, self.lowest), self.highest)
+        return min(max(_DEFAULT_FREQUENCY, self.lowest), self.highest)
 
     @cached_property
     def second_frequency(self) -> int:

@@ -22,14 +22,14 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_last, pack_layers, parts
 from drivers.wires.wire import reply_words
 from era_haptics.lab.conformance.capabilities import STATED, Capabilities
-from era_haptics.lab.conformance.client import (
+from era_haptics.lab.conformance.dating import Dating, When
+from era_haptics.lab.conformance.judge import Judge
+from era_haptics.lab.conformance.judge_client import (
     JUDGE_REPLY_TIMEOUT,
     QUIET_TIME,
     JudgeClient,
     RequestOutcome,
 )
-from era_haptics.lab.conformance.dating import Dating, When
-from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.outcomes import (
     TooLate,
     expect_equal,

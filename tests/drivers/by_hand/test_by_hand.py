@@ -42,7 +42,7 @@ from drivers.urls import (
 )
 from drivers.wires.wire import schemes
 from era_haptics.lab.cli import app as lab_app
-from era_haptics.lab.conformance.report import ConformanceReport
+from era_haptics.lab.conformance.conformance_report import ConformanceReport
 from kit.wires import WORD_WIRES, WordFarSide
 from model.rig.rig_file import example_rig_path
 from processes.patient_daemon import LONG_WATCHDOG, wait_long

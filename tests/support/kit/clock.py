@@ -33,9 +33,9 @@ from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_frames import FrameReader
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
+from era_haptics.lab.conformance.conformance_report import CheckResult
 from era_haptics.lab.conformance.connection import CLIENTS as BY_PROTOCOL
 from era_haptics.lab.conformance.contract import CHECKS, of_kind
-from era_haptics.lab.conformance.report import CheckResult
 from era_haptics.lab.conformance.session import DEFAULT_LEVEL, CheckSession
 from registry import threads
 from registry.limits import GuardLimits

@@ -22,7 +22,7 @@ from drivers.protocol.definition import (
 from drivers.wires.can_frames import CANOPEN, cob_id, segments
 from era_haptics.lab.conformance.can_client import UPLOAD, CanClient
 from era_haptics.lab.conformance.check import driving, reading
-from era_haptics.lab.conformance.client import RequestOutcome
+from era_haptics.lab.conformance.judge_client import RequestOutcome
 from era_haptics.lab.conformance.outcomes import (
     ContractViolation,
     expect_equal,
@@ -263,9 +263,9 @@ def _object_entries(
     for number, word in enumerate(caps.words, 1):
         yield ObjectEntry(0x2001, number, 2, word)
     yield ObjectEntry(0x2002, 0, 1, len(status.words))
-    steady_places = {STATUS.places[name] for name in _STEADY_FIELDS}
+    steady_positions = {STATUS.places[name] for name in _STEADY_FIELDS}
     for place, word in enumerate(status.words):
-        yield ObjectEntry(0x2002, place + 1, 2, word if place in steady_places else None)
+        yield ObjectEntry(0x2002, place + 1, 2, word if place in steady_positions else None)
 
 
 async def _expect_missing_objects(

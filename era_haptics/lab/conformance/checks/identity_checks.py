@@ -11,7 +11,7 @@ from drivers.protocol.definition import (
     has_flag,
 )
 from era_haptics.lab.conformance.check import driving, reading
-from era_haptics.lab.conformance.client import JudgeClient
+from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.outcomes import (
     AlreadyArmed,
     expect_equal,

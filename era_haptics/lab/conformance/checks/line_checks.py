@@ -16,7 +16,7 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Values
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.checks.request_checks import UNKNOWN_NUMBERS, valid_words
-from era_haptics.lab.conformance.client import HeardMessage, JudgeClient
+from era_haptics.lab.conformance.judge_client import HeardMessage, JudgeClient
 from era_haptics.lab.conformance.outcomes import (
     ContractViolation,
     TooLate,

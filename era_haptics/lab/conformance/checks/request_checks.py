@@ -7,7 +7,7 @@ from typing import Any
 
 from drivers.protocol.definition import MESSAGES, REACTION, RESERVED_MESSAGES
 from era_haptics.lab.conformance.check import driving, reading
-from era_haptics.lab.conformance.client import in_batches
+from era_haptics.lab.conformance.judge_client import in_batches
 from era_haptics.lab.conformance.outcomes import expect_equal, expect_within
 from era_haptics.lab.conformance.requests import RequestRows, send, stage
 from era_haptics.lab.conformance.subject import Subject

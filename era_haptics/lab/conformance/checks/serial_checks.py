@@ -92,7 +92,7 @@ async def tolerated_frames(subject: Subject) -> None:
         return client.request(_PING, [1, 0])
 
     frame = ping()
-    longest_frame = client.request(_SET, (), extra=bytes(240))
+    full_frame = client.request(_SET, (), extra=bytes(240))
     for description, pieces, count in (
         ("a pause within", [frame[:5], frame[5:]], 1),
         ("noise before it", [b"\x55\xaa\x01" + ping()], 1),
@@ -100,7 +100,7 @@ async def tolerated_frames(subject: Subject) -> None:
         ("half a frame before it", [ping()[:7] + ping()], 1),
         ("another frame back to back", [ping() + ping()], 2),
         ("300 bytes of noise before it", [b"\x77" * 300 + ping()], 1),
-        ("the longest payload before it", [longest_frame + ping()], 2),
+        ("the longest payload before it", [full_frame + ping()], 2),
         ("a shared delimiter", [ping()[:-1] + ping()], 2),
     ):
         for piece in pieces[:-1]:

@@ -9,7 +9,7 @@ from drivers.protocol.definition import COMMAND, ENVELOPE, LAYER, QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers
 from era_haptics.lab.conformance.check import driving
-from era_haptics.lab.conformance.client import in_batches
+from era_haptics.lab.conformance.judge_client import in_batches
 from era_haptics.lab.conformance.outcomes import expect_within, require
 from era_haptics.lab.conformance.requests import (
     FULL,

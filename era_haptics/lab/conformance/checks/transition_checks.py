@@ -191,11 +191,11 @@ def extreme_envelopes(subject: Subject) -> RequestRows:
     for number in range(subject.can["knots"]):
         level = 0.2 + 0.8 * (number % 5) / 4
         amplitudes.append(level if number % 3 else -level)
-    shortest = subject.can["envelope_step_min"] / 10_000
-    longest = subject.can["envelope_step_max"] / 10_000
+    step_min = subject.can["envelope_step_min"] / 10_000
+    step_max = subject.can["envelope_step_max"] / 10_000
     onsets = [
-        subject.envelope(shortest, *amplitudes),
+        subject.envelope(step_min, *amplitudes),
         subject.envelope(0.01, *amplitudes),
-        subject.envelope(longest, 1.0),
+        subject.envelope(step_max, 1.0),
     ]
     return [[subject.layer_0(subject.tone(0, 0.5, onset=onset))] for onset in onsets]

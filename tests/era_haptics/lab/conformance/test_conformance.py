@@ -26,11 +26,11 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.serial_frames import FrameReader
 from era_haptics.lab.conformance.check import ConformanceCheck
 from era_haptics.lab.conformance.checks import state_checks
+from era_haptics.lab.conformance.conformance_report import CheckResult, ConformanceReport, Result
 from era_haptics.lab.conformance.contract import CHECKS, of_kind
 from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.outcomes import ContractViolation, TooLate
-from era_haptics.lab.conformance.report import CheckResult, ConformanceReport, Result
 from era_haptics.lab.conformance.requests import layer
 from era_haptics.lab.conformance.run import ConformanceRun
 from era_haptics.lab.conformance.session import judge

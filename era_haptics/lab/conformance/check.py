@@ -6,7 +6,7 @@ from functools import partial
 from inspect import getdoc
 from typing import Any, TypeAlias
 
-from era_haptics.lab.conformance.requests import RequestRows
+from era_haptics.lab.conformance.request_rows import RequestRows
 
 Steps: TypeAlias = Callable[[Any], Awaitable[None] | RequestRows]
 """Steps of a check: a coroutine for a Subject or its JudgeClient, or rows to carry out."""

@@ -23,7 +23,7 @@ from era_haptics.lab.conformance.outcomes import (
     read_as,
     verify,
 )
-from era_haptics.lab.conformance.requests import FULL
+from era_haptics.lab.conformance.request_rows import FULL
 from era_haptics.lab.conformance.set_text import set_text
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads

@@ -14,7 +14,7 @@ from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.capabilities import Capabilities
 from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.outcomes import require
-from era_haptics.lab.conformance.requests import FULL, Send, layer, play_now
+from era_haptics.lab.conformance.request_rows import FULL, Send, layer, play_now
 
 READ_REQUESTS = ("GetCaps", "GetStatus", "GetFaults")
 """Messages that only read: on Modbus each takes half an exchange."""

@@ -39,7 +39,7 @@ from era_haptics.lab.conformance.outcomes import (
     require_in_time,
     verify,
 )
-from era_haptics.lab.conformance.requests import (
+from era_haptics.lab.conformance.request_rows import (
     FULL,
     RequestRows,
     Row,

@@ -33,7 +33,7 @@ from era_haptics.lab.conformance.outcomes import (
     require_in_time,
     verify,
 )
-from era_haptics.lab.conformance.requests import layer
+from era_haptics.lab.conformance.request_rows import layer
 from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
 from registry import threads

@@ -20,7 +20,7 @@ from era_haptics.lab.conformance.outcomes import (
     require,
     verify,
 )
-from era_haptics.lab.conformance.requests import RequestRows, send
+from era_haptics.lab.conformance.request_rows import RequestRows, send
 from era_haptics.lab.conformance.subject import RATE_STEP, Subject
 from era_haptics.lab.expected_output import DRIFT
 from registry import threads

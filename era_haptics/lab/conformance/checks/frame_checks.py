@@ -3,7 +3,7 @@
 from drivers.protocol.definition import MESSAGES
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import verify
-from era_haptics.lab.conformance.requests import layer
+from era_haptics.lab.conformance.request_rows import layer
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 

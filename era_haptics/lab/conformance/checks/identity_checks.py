@@ -19,7 +19,7 @@ from era_haptics.lab.conformance.outcomes import (
     expect_within,
     verify,
 )
-from era_haptics.lab.conformance.requests import layer, send
+from era_haptics.lab.conformance.request_rows import layer, send
 from era_haptics.lab.conformance.run import greeted
 from era_haptics.lab.conformance.subject import Subject
 

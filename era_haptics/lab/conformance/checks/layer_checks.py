@@ -7,7 +7,7 @@ from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import require_in_time
-from era_haptics.lab.conformance.requests import RequestRows, Row, layer, play_now, send, stage
+from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send, stage
 from era_haptics.lab.conformance.subject import Subject
 
 _BIT_15 = 1 << 15  # ms

@@ -25,7 +25,7 @@ from era_haptics.lab.conformance.outcomes import (
     require_in_time,
     verify,
 )
-from era_haptics.lab.conformance.requests import send, stage
+from era_haptics.lab.conformance.request_rows import send, stage
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 

@@ -23,7 +23,7 @@ from drivers.wires.modbus_frames import (
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.modbus_client import ModbusClient
 from era_haptics.lab.conformance.outcomes import expect_equal, require_in_time, verify
-from era_haptics.lab.conformance.requests import send, stage
+from era_haptics.lab.conformance.request_rows import send, stage
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 

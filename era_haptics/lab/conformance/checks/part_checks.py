@@ -10,7 +10,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import require
-from era_haptics.lab.conformance.requests import (
+from era_haptics.lab.conformance.request_rows import (
     RequestRows,
     Row,
     Send,

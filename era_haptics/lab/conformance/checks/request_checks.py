@@ -9,7 +9,7 @@ from drivers.protocol.definition import MESSAGES, REACTION, RESERVED_MESSAGES
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import in_batches
 from era_haptics.lab.conformance.outcomes import expect_equal, expect_within
-from era_haptics.lab.conformance.requests import RequestRows, send, stage
+from era_haptics.lab.conformance.request_rows import RequestRows, send, stage
 from era_haptics.lab.conformance.subject import Subject
 
 UNKNOWN_NUMBERS = (*RESERVED_MESSAGES, 20, 24, 29, 63)

@@ -8,7 +8,7 @@ from drivers.wires.serial_frames import REPLY_BIT
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.checks.request_checks import UNKNOWN_NUMBERS
 from era_haptics.lab.conformance.outcomes import expect_equal
-from era_haptics.lab.conformance.requests import stage
+from era_haptics.lab.conformance.request_rows import stage
 from era_haptics.lab.conformance.serial_client import SerialClient
 from era_haptics.lab.conformance.subject import Subject
 

@@ -11,7 +11,7 @@ from drivers.protocol.sets import Command, Envelope, pack_layers
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import in_batches
 from era_haptics.lab.conformance.outcomes import expect_within, require
-from era_haptics.lab.conformance.requests import (
+from era_haptics.lab.conformance.request_rows import (
     FULL,
     RequestRows,
     Row,

@@ -19,7 +19,7 @@ from drivers.protocol.sets import LayerSet
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import RequestOutcome
 from era_haptics.lab.conformance.outcomes import expect_within
-from era_haptics.lab.conformance.requests import (
+from era_haptics.lab.conformance.request_rows import (
     FULL,
     RequestRows,
     Row,

@@ -5,7 +5,7 @@ from functools import partial
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import token_after
 from era_haptics.lab.conformance.check import driving
-from era_haptics.lab.conformance.requests import RequestRows, Row, layer, play_now, send, stage
+from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send, stage
 from era_haptics.lab.conformance.subject import Subject
 
 _WATCHDOG, _MAX_RAMP = QUANTITIES["watchdog"], QUANTITIES["ramp"].maximum

@@ -8,7 +8,7 @@ from drivers.protocol.definition import HIGH_TIME, HIGH_WORDS, has_flag
 from drivers.protocol.sets import Command, Envelope
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import expect_equal, require
-from era_haptics.lab.conformance.requests import RequestRows, Row, layer, play_now, send
+from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send
 from era_haptics.lab.conformance.subject import Subject
 
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange

@@ -6,7 +6,7 @@ from functools import partial
 
 from drivers.protocol.sets import Envelope
 from era_haptics.lab.conformance.check import driving
-from era_haptics.lab.conformance.requests import RequestRows, Row, layer, send
+from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, send
 from era_haptics.lab.conformance.subject import Subject
 
 _STEPS_PER_MS = 10  # of an envelope's step

@@ -9,7 +9,7 @@ from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.checks.part_checks import long_set
 from era_haptics.lab.conformance.checks.state_checks import rows_while_latched
 from era_haptics.lab.conformance.outcomes import expect_equal
-from era_haptics.lab.conformance.requests import RequestRows, Row, layer, play_now, send, stage
+from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send, stage
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 

@@ -31,7 +31,7 @@ from era_haptics.lab.conformance.contract import CHECKS, of_kind
 from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.outcomes import ContractViolation, TooLate
-from era_haptics.lab.conformance.requests import layer
+from era_haptics.lab.conformance.request_rows import layer
 from era_haptics.lab.conformance.run import ConformanceRun
 from era_haptics.lab.conformance.session import judge
 from era_haptics.lab.conformance.set_text import set_text

@@ -44,7 +44,7 @@ _DRIVING_OBSTACLES: dict[type[CheckOutcome], str] = {
 """Outcomes after which no check may drive the amplifier, with the reason."""
 
 
-class Attempt(NamedTuple):
+class CheckAttempt(NamedTuple):
     """Outcome of one attempt at a check, and why no further check can run, or ""."""
 
     outcome: CheckOutcome
@@ -112,14 +112,14 @@ class ConformanceRun:
             return self._driving_obstacle
         return self._obstacle
 
-    def _note_obstacles(self, check: ConformanceCheck, attempt: Attempt) -> None:
+    def _note_obstacles(self, check: ConformanceCheck, attempt: CheckAttempt) -> None:
         """Record why further checks cannot run after the last attempt at a check."""
         if attempt.obstacle:
             self._obstacle = f"not run because {check.name} failed"
         if not self._driving_obstacle:
             self._driving_obstacle = _DRIVING_OBSTACLES.get(type(attempt.outcome), "")
 
-    def _reason_of(self, attempt: Attempt) -> str:
+    def _reason_of(self, attempt: CheckAttempt) -> str:
         reason = str(attempt.outcome)
         if isinstance(attempt.outcome, TooLate):
             lateness = self._client.lateness
@@ -134,7 +134,7 @@ class ConformanceRun:
 
     # Attempts
 
-    async def _last_attempt(self, check: ConformanceCheck) -> Attempt:
+    async def _last_attempt(self, check: ConformanceCheck) -> CheckAttempt:
         """Attempt a check until this machine was in time; return the last attempt."""
         lateness = self._client.lateness
         doubtful_violations = 0
@@ -151,7 +151,7 @@ class ConformanceRun:
             if not is_undecided or attempt.obstacle or not lateness.repeats(started_at):
                 return attempt
 
-    async def _attempt(self, check: ConformanceCheck) -> Attempt:
+    async def _attempt(self, check: ConformanceCheck) -> CheckAttempt:
         """Run the steps of a check once, then bring the amplifier to rest."""
         client = self._client
         client.inbox.clear()
@@ -174,11 +174,11 @@ class ConformanceRun:
             if is_violation and not check.greets:
                 outcome.last_set = set_text(self._subject.sent_set)
         if check.greets and type(outcome) is CheckOutcome:
-            return Attempt(outcome, "")
+            return CheckAttempt(outcome, "")
         failure = await self._leave(check)
         if failure is None:
-            return Attempt(outcome, "")
-        return Attempt(outcome if is_violation else failure, str(failure))
+            return CheckAttempt(outcome, "")
+        return CheckAttempt(outcome if is_violation else failure, str(failure))
 
     async def _carry_out(self, check: ConformanceCheck, subject: Subject) -> None:
         """Carry out the steps of a check; a check that drives channels starts at rest."""

@@ -5,8 +5,8 @@ It belongs to this package because `import era_haptics` first checks where its p
 
 from collections.abc import Sequence
 
-from controller.cli import main as command_line
-from controller.cli.main import CommandModule
+from registry import command_line
+from registry.command_line import CommandModule
 
 
 def command_modules() -> Sequence[CommandModule]:

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from controller.cli.main import CommandModule, main
+from registry.command_line import CommandModule, main
 
 
 def command_modules() -> Sequence[CommandModule]:

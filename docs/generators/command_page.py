@@ -10,8 +10,8 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from controller.cli.main import join_commands
 from era_haptics.command import command_modules
+from registry.command_line import join_commands
 
 _MANY = 6
 """So many commands with the same argument or option: it is a common one."""

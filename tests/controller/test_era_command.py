@@ -26,7 +26,6 @@ import typer
 from typer.core import TyperGroup
 
 from controller.cli.daemon_cli import position_on
-from controller.cli.main import LoadModules, join_commands, run
 from controller.daemon.children import gateway_options
 from controller.process.daemon_process import SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
@@ -35,6 +34,7 @@ from model.errors import InputError
 from packages import PACKAGES
 from processes.gateways import wait_for
 from processes.interrupted import full_disk
+from registry.command_line import LoadModules, join_commands, run
 from registry.service_manager import ServiceManager
 
 
@@ -264,7 +264,7 @@ def run_typed(folder: Path, *arguments: str, **environment: str) -> "subprocess.
     """A process that runs the test commands, which are written to a folder."""
     (folder / f"{MODULE}.py").write_text(dedent(COMMANDS), encoding="utf-8")
     script = (
-        "import importlib, controller.cli.main as m\n"
+        "import importlib, registry.command_line as m\n"
         f"raise SystemExit(m.main(lambda: [importlib.import_module({MODULE!r})]))"
     )
     return subprocess.Popen(
@@ -388,7 +388,7 @@ def test_main_ends_quietly_and_prints_what_its_output_cannot_encode(
 LOADED = """
 import contextlib, io, sys
 from importlib.metadata import packages_distributions
-from controller.cli.main import join_commands
+from registry.command_line import join_commands
 from era_haptics.command import command_modules, run_era
 
 if "all" in sys.argv:

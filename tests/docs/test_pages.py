@@ -28,7 +28,6 @@ import pages
 from controller.api.methods import StateEvent
 from controller.api.schema import headline
 from controller.cli.config_cli import app as config_commands
-from controller.cli.main import join_commands
 from controller.daemon.config import DaemonSection, LogSection, TouchSection
 from controller.operation.operation_states import DaemonState
 from drivers.by_hand.cli import amp
@@ -41,6 +40,7 @@ from model.cli import app
 from model.study import overview
 from packages import PACKAGES
 from processes.typed_page import Reader, difference, read_steps
+from registry.command_line import join_commands
 from registry.limits import GuardLimits
 
 ROOT = Path(__file__).parents[2]

@@ -25,7 +25,6 @@ from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import ContactStatus
 from controller.cli.commands import app
-from controller.cli.main import BAD_INPUT
 from controller.cli.status_text import show_status
 from controller.daemon.children import gateway_options
 from controller.daemon.daemon import run_daemon
@@ -68,6 +67,7 @@ from processes.daemons import (
 )
 from processes.gateways import UNCONFIRMED, ScriptedDaemon, real_daemon
 from registry import threads
+from registry.command_line import BAD_INPUT
 from sim.faults import FaultWindow
 
 LAYOUTS = "layouts: {home: home.yaml, climate: climate.yaml}\n"

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.cli.main import BUG
 from controller.content.formats import named_content, read_content
 from controller.daemon.config import load_daemon_config
 from controller.effects.layout import load_layout
@@ -37,6 +36,7 @@ from model.files.modal_file import read_modes
 from model.files.uff import read_measured_bytes
 from model.rig.rig_file import base_fingerprint, example_rig_path, load_rig
 from model.table.table_file import load_table, save_table
+from registry.command_line import BUG
 from sim.faults import load_faults
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

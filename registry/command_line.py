@@ -1,6 +1,6 @@
 """How commands run: one group for the commands of several modules, and an exit status per error.
 
-`era_haptics.command` lists the modules of `era`, `controller.cli.__main__` the modules here.
+`era_haptics.command` lists the modules of `era`, `controller.cli.__main__` those of the controller.
 """
 
 import errno

@@ -95,7 +95,7 @@ def play(
         return
     with connected(socket) as era:
         if file.suffix:
-            from controller.content.points import points_of
+            from era_haptics.lab.checks.content_points import points_of
 
             points, taps = points_of(pattern_of(file, channel))
             era.play(points, place, taps=taps, level_db_sl=level, loop=loop)

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import islice, product
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 from controller.sources.osc import Argument, osc_messages, read_message
 from controller.sources.touch import Touch, TouchFrame
@@ -30,6 +30,9 @@ SERVED = (CURSORS, BLOBS)
 
 _Key: TypeAlias = tuple[str, int]
 """Profile and session id of a contact."""
+
+_KeyPair: TypeAlias = tuple[_Key, _Key]
+"""Keys of a contact's cursor and blob, equal if it is only one of these."""
 
 _NEAR = 0.02  # of the sensor: a cursor this close to the centre of a small blob is the same contact
 _PARTED = 4.0  # at this multiple of the distance they separate again; fast movement stays below it
@@ -116,14 +119,6 @@ _BundleKind: TypeAlias = tuple[Peer, bytes, bool, bool]
 """Sender, its name, and whether a bundle has cursors and blobs."""
 
 
-class _IdentifiedTouch(NamedTuple):
-    """A touch with the id of its contact."""
-
-    touch: Touch
-    keys: tuple[_Key, ...] = ()
-    """Of its cursor and blob, for a sender of blobs."""
-
-
 @dataclass
 class _Sender:
     """State of a sender."""
@@ -157,8 +152,8 @@ class _Sender:
             self.former = self.peer
             self.peer = peer
 
-    def contacts(self, *, since: float) -> list[_IdentifiedTouch]:
-        """Return the contacts of profiles received since a time [s].
+    def contacts(self, *, since: float) -> dict[_KeyPair, Touch]:
+        """Return the touches of profiles received since a time [s], by cursor and blob.
 
         A contact that is both a cursor and a blob is a cursor with the blob's size, and keeps its
         id as long as the cursor or the blob is alive.
@@ -169,26 +164,28 @@ class _Sender:
                 for number, touch in profile.touches.items():
                     received[address, number] = touch
         if BLOBS not in self.profiles:
-            return [_IdentifiedTouch(touch) for touch in received.values()]
+            return {(key, key): touch for key, touch in received.items()}
         blobs = _blobs_of_cursors(received, self.ids)
         unpaired = [key for key in received if key not in blobs.values()]
         unpaired.sort(key=lambda key: key not in self.ids)
-        contacts: dict[int, _IdentifiedTouch] = {}
+        contacts: dict[_KeyPair, Touch] = {}
+        ids = set[int]()
         for key in unpaired:
             blob_key = blobs.get(key, key)
             touch = received[key]
             id = self.ids.get(key, self.ids.get(blob_key, touch.id))
-            while id in contacts:
+            while id in ids:
                 id += _APART_IDS
-            joined = replace(touch, id=id, size=received[blob_key].size)
-            contacts[id] = _IdentifiedTouch(joined, (key, blob_key))
-        return list(contacts.values())
+            ids.add(id)
+            contacts[key, blob_key] = replace(touch, id=id, size=received[blob_key].size)
+        return contacts
 
-    def remember(self, contacts: Sequence[_IdentifiedTouch]) -> None:
+    def remember(self, contacts: Mapping[_KeyPair, Touch]) -> None:
         """Remember the ids of the contacts in a frame, and whether there are any."""
-        self.ids = {}
-        for contact in contacts:
-            self.ids |= dict.fromkeys(contact.keys, contact.touch.id)
+        if BLOBS in self.profiles:
+            self.ids = {}
+            for keys, touch in contacts.items():
+                self.ids |= dict.fromkeys(keys, touch.id)
         self.resting = 0 if contacts else self.resting + 1
 
 
@@ -277,7 +274,7 @@ class TuioSource(UdpSource):
         sender.take(changed, peer, arrived)
         contacts = sender.contacts(since=arrived - self.timeout)
         sender.remember(contacts)
-        touches = tuple(contact.touch for contact in contacts)
+        touches = tuple(contacts.values())
         origin = f"tuio:{peer[0]}:{peer[1]}"
         return TouchFrame(name, arrived, touches, self.timeout, origin=origin)
 

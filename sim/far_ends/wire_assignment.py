@@ -23,9 +23,9 @@ from drivers.wires.can_frames import BITRATE
 from drivers.wires.wire import address_of
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.far_ends.can_amplifiers import BUS_NAME, BusNodes, CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from sim.far_ends.simulated_bus import BUS_NAME, BusNodes, CanBus, SlcanAdapter, SocketcandClient
 from sim.faults import Faults
 from sim.transport.far_end import HOST, FarEnd, MakeEnd, SendBytes, TcpEnd, TerminalEnd
 from sim.transport.simulated_line import LINE_NAMES, PROMPT, delays_of

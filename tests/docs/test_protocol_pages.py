@@ -39,7 +39,7 @@ from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.contract import CHECKS
 from protocol_bytes import BYTES
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.far_ends.can_amplifiers import ObjectServer
+from sim.far_ends.canopen_objects import ObjectServer
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"
 

@@ -41,7 +41,7 @@ from kit.wires import age as age
 from processes.interrupted import full_disk
 from protocol_tables import records
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.far_ends.can_amplifiers import ObjectServer, SdoAbort
+from sim.far_ends.canopen_objects import ObjectServer, SdoAbort
 
 STATED = {"older": {"later_voltage": None}, "same": {"later_voltage": WORD}, "newer": {}}
 """Of what is added, by the age of the amplifier."""

@@ -37,9 +37,10 @@ from model.rig.rig import Rig
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
-from sim.far_ends.can_amplifiers import CanAmplifiers, CanBus, SlcanAdapter, SocketcandClient
+from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from sim.far_ends.simulated_bus import CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import Faults
 from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd

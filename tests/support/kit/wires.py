@@ -44,15 +44,10 @@ from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.far_ends.can_amplifiers import (
-    BusNodes,
-    CanAmplifiers,
-    CanBus,
-    SlcanAdapter,
-    SocketcandClient,
-)
+from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from sim.far_ends.simulated_bus import BusNodes, CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.wire_assignment import FAR_ENDS, SimulatedWire, open_wires
 from sim.faults import Faults
 from sim.plant.imperfections import Imperfections

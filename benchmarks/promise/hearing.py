@@ -158,7 +158,7 @@ class Heard:
         self, bench: Bench, spans: Sequence[Span], strongest: bool
     ) -> tuple[FloatArray, FloatArray]:
         """Mean powers (n, points) over windows, and the weights of the points."""
-        records = [bench.fingers.felt(*span)[str(self.finger)] for span in spans]
+        records = [bench.sample_fingers().felt(*span)[str(self.finger)] for span in spans]
         accelerations = np.concatenate([record.accelerations for record in records])
         energy = np.cumsum(accelerations**2, axis=0)
         count = round(STRONGEST * bench.sample_rate) if strongest else len(energy) - 1

@@ -2,12 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Assembly, Command, LayerSet, is_newer_token, unpack_layers
 
 Layers: TypeAlias = tuple[LayerSet, ...]
+
+
+class TakenSet(NamedTuple):
+    """A set after its last part was taken."""
+
+    layers: Layers = ()
+    """Its layers; empty while a part is missing."""
+    missing: int | None = None
+    """Number of the first missing part; None if the set is complete."""
 
 
 class SetIntake:
@@ -35,17 +44,16 @@ class SetIntake:
             self._staged = None
         return self._parts.keep(part, now)
 
-    def take(self, part: Values, now: float) -> Layers | int:
-        """Take the last part of a set that was not committed, at a time [s].
+    def take(self, part: Values, now: float) -> TakenSet:
+        """Take the last part of a set that was not committed, at a time [s]; stage a complete set.
 
-        Returns the staged layers, or the number of the first missing part.
         Raises Refusal; this drops only the parts of this set, and only if it is complete.
         """
         token = part["token"]
         under_way = self._under_way(now)
         is_under_way = token == under_way
         if is_under_way and self._staged is not None:  # a repetition
-            return self._staged
+            return TakenSet(self._staged)
         replaced = 0 if is_under_way else under_way
         for older in (self.committed, replaced):
             if not is_newer_token(token, older):
@@ -53,7 +61,7 @@ class SetIntake:
         self._check_numbers(part, is_under_way=is_under_way)
         stream = self._parts.whole(part)
         if isinstance(stream, int):
-            return stream
+            return TakenSet(missing=stream)
         try:
             layers = self._checked(stream)
         except Refusal:
@@ -63,7 +71,7 @@ class SetIntake:
         if not is_under_way:
             self._parts = Assembly(token, part["parts"], now)
         self._staged = layers
-        return layers
+        return TakenSet(layers)
 
     def _check_numbers(self, part: Values, *, is_under_way: bool) -> None:
         """Raise Refusal for a part whose index or number of parts cannot be."""

@@ -18,8 +18,9 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 
-from drivers.playing import Voice, playback_of
+from drivers.playing import Playback, Voice, playback_of
 from drivers.protocol.definition import (
     AHEAD_MAX,
     FAULTS,
@@ -60,7 +61,8 @@ _FAULTS_KEPT = 16
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _DERATING_RAMP = 0.02  # s; no click
 _ENABLED = "OPERATION_ENABLED"
-_ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
+_ONCE_SILENT = {"SWITCHED_ON": "SWITCH_ON_DISABLED", "FAULT_REACTION_ACTIVE": "FAULT"}
+"""The state that follows by itself once all channels are silent."""
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
 _Q = QUANTITIES
 _OFF = ("SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON")
@@ -87,6 +89,16 @@ AMPLIFIER_TRANSITIONS: Mapping[tuple[str, str], str] = {
 """The state after a request, by state and name of the request."""
 
 
+class _Event(Enum):
+    """An event that happens without a request; simultaneous ones happen in this order."""
+
+    SET_STARTS = auto()
+    LAYER_IS_DUE = auto()
+    SILENT = auto()
+    WATCHDOG_EXPIRES = auto()
+    TOO_HOT = auto()
+
+
 @dataclass(frozen=True)
 class _WaitingSet:
     """A committed set that plays at a moment [s]; commit: values of its Commit."""
@@ -100,11 +112,35 @@ class SimulatedAmplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
     listeners: called with the values of every Event, and its time [s]. capabilities: changes take
-    effect at the next restart. session: the current session while armed, or the last one. clock:
-    reference of phases, by default without errors.
+    effect at the next restart. clock: reference of phases, by default without errors.
     """
 
     is_answering = True
+    playback: Playback
+    """The voices of all channels."""
+    session: int
+    """The current session while armed, or the last one; 0 before the first."""
+    is_derated: bool
+    """Whether levels are lowered because it is hot."""
+    silent_from: float
+    """When the last ramp to silence ends [s]."""
+    _channels: range
+    _intake: SetIntake
+    _waiting: _WaitingSet | None
+    _watchdog: float
+    """Time without feeding after which the watchdog expires [s]."""
+    _last_fed: float
+    """When the watchdog was fed [s]."""
+    _discharged_from: float
+    """When the last ramp to silence with high voltage ended [s]."""
+    _marked: int | None
+    """Clock at a Mark that no status has shown."""
+    _is_limited: bool
+    """Whether a sum of layers was limited since the last status."""
+    _shown_mark: int | None
+    """The mark that the last status has shown."""
+    _has_shown_limited: bool
+    """Whether the last status has shown a limited sum."""
 
     def __init__(
         self,
@@ -135,20 +171,19 @@ class SimulatedAmplifier:
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
         self.playback = playback_of(self.capabilities)
+        self.session = 0
+        self.is_derated = False
+        self.silent_from = -math.inf
         self._channels = range(self.playback.channels)
         self._intake = SetIntake(self.capabilities)
-        self.session = 0
-        self._waiting: _WaitingSet | None = None
-        self._marked: int | None = None  # clock of a Mark that no status has shown
-        self._is_limited = False  # a sum was limited since the last status
-        # The mark and the limited sum that the last status has shown.
-        self._shown_mark: int | None = None
-        self._has_shown_limited = False
+        self._waiting = None
         self._watchdog = 0.0
         self._last_fed = 0.0
-        self.silent_from = -math.inf  # end of the last silencing ramp
-        self._discharged_from = -math.inf  # of the last one while high voltage was on
-        self.is_derated = False
+        self._discharged_from = -math.inf
+        self._marked = None
+        self._is_limited = False
+        self._shown_mark = None
+        self._has_shown_limited = False
 
     @property
     def outputs(self) -> Sequence[tuple[Voice, ...]]:
@@ -158,40 +193,59 @@ class SimulatedAmplifier:
     @property
     def next_event(self) -> float:
         """Time of the next event [s]; playback is known until then."""
-        due = self.playback.next_due
-        if self._waiting is not None:
-            due = min(due, self._waiting.moment)
-        if self.state in _ENDING:
-            return min(due, self.silent_from)
+        moment, _ = self._next()
+        return moment
+
+    def _next(self) -> tuple[float, _Event]:
+        """Return the next event and its time [s], infinite if none is due."""
+        moment = self.playback.next_due
+        event = _Event.LAYER_IS_DUE
+        if self._waiting is not None and self._waiting.moment <= moment:
+            moment = self._waiting.moment
+            event = _Event.SET_STARTS
+        if self.state in _ONCE_SILENT and self.silent_from < moment:
+            return self.silent_from, _Event.SILENT
         if self.state != _ENABLED:
-            return due
-        hot = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
-        return min(due, self._last_fed + self._watchdog, hot)
+            return moment, event
+        expires_at = self._last_fed + self._watchdog
+        if expires_at < moment:
+            moment = expires_at
+            event = _Event.WATCHDOG_EXPIRES
+        hot_at = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
+        if hot_at < moment:
+            return hot_at, _Event.TOO_HOT
+        return moment, event
 
     def tick(self, now: float) -> None:
         """Process the events due at now, in order."""
-        while (moment := self.next_event) <= now:
-            if self._waiting is not None and moment == self._waiting.moment:
-                self._start_waiting(moment)
-            elif moment == self.playback.next_due:
-                self.playback.advance(moment)
-                self._changed(moment)
-            elif self.state == _ENABLED and moment == self._last_fed + self._watchdog:
-                self.trip("WATCHDOG", moment)
-            elif self.state != _ENABLED:
-                fell_silent = self.state == "FAULT_REACTION_ACTIVE"
-                self._enter("FAULT" if fell_silent else "SWITCH_ON_DISABLED", moment)
-            else:
-                self._handle_overtemperature(moment)
+        moment, event = self._next()
+        while moment <= now:
+            self._process(event, moment)
+            moment, event = self._next()
         self.playback.advance(now)
         if self.is_derated and self._heat.at(now) < GOOD_BELOW:
             self.is_derated = False
 
-    def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s]; none to a part of a
-        set other than the last.
+    def _process(self, event: _Event, moment: float) -> None:
+        """Carry out an event at its time [s]."""
+        match event:
+            case _Event.SET_STARTS:
+                self._start_waiting(moment)
+            case _Event.LAYER_IS_DUE:
+                self.playback.advance(moment)
+                self._changed(moment)
+            case _Event.SILENT:
+                self._enter(_ONCE_SILENT[self.state], moment)
+            case _Event.WATCHDOG_EXPIRES:
+                self.trip("WATCHDOG", moment)
+            case _Event.TOO_HOT:
+                self._handle_overtemperature(moment)
 
-        Raises Refusal; the request is then not applied.
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Carry out a request at a time [s], and return the values of its reply.
+
+        They are empty for a part of a set other than the last. Raises Refusal; the request is then
+        not applied.
         """
         self.tick(now)
         if name == "Set" and not is_last(values):
@@ -208,8 +262,12 @@ class SimulatedAmplifier:
         reply = self._carry_out(name, values, following, now)
         if message.feeds and self.state == _ENABLED:
             self.feed(now)
+        if reply is not None:
+            return reply
         # After feeding the watchdog, so that the status shows it full.
-        return self.status(now) if reply is None else reply
+        status = self.status(now)
+        self._acknowledge_status(now)
+        return status
 
     def feed(self, now: float) -> None:
         """Restart the watchdog at a time [s]."""
@@ -219,18 +277,12 @@ class SimulatedAmplifier:
         """Return the values of the status at a time [s] up to which it has been ticked."""
         levels = self._levels(now)
         is_on = self._is_high_voltage(levels)
-        # A lasting sum is limited again in each status.
-        self._is_limited |= self._is_sum_limited(now)
         flags = {
             "high_voltage": is_on,
             "interlock_open": self._is_interlock_open,
-            "limited": self._is_limited,
+            "limited": self._is_limited or self._is_sum_limited(now),
         }
         clock = self.clock.reading(now) if self._marked is None else self._marked
-        self._shown_mark = self._marked
-        self._has_shown_limited = self._is_limited
-        self._marked = None
-        self._is_limited = False
         watchdog_left = 0.0
         if self.state == _ENABLED:
             watchdog_left = max(self._last_fed + self._watchdog - now, 0.0)
@@ -260,6 +312,13 @@ class SimulatedAmplifier:
         """Supply voltage relative to its nominal value at a time [s] while it is off."""
         elapsed = max(0.0, now - self._discharged_from)
         return math.exp(-elapsed / _DISCHARGE)
+
+    def _acknowledge_status(self, now: float) -> None:
+        """Note that a status at a time [s] has shown the mark and the limited sum."""
+        self._shown_mark = self._marked
+        self._has_shown_limited = self._is_limited or self._is_sum_limited(now)
+        self._marked = None
+        self._is_limited = False
 
     def withdraw_status(self) -> None:
         """Withdraw the last status, as after a broadcast: the next one shows the same."""
@@ -424,24 +483,34 @@ class SimulatedAmplifier:
             self._enter(following, now)
 
     def take_part(self, part: Values, now: float) -> Values:
-        """Take the last part of a set, and play the set if it is complete and to play now."""
+        """Take the last part of a set, and play the set if it is complete and to play now.
+
+        Returns the values of the reply; raises Refusal.
+        """
         token = part["token"]
-        # Layers of a complete set, number of a missing part, or None for a set committed before.
-        intake: Layers | int | None = None
-        if token != self._intake.committed:
-            intake = self._intake.take(part, now)
-        is_missing = isinstance(intake, int)
-        is_staged = not (intake is None or is_missing or part["now"])
-        if isinstance(intake, tuple) and part["now"]:
-            self._intake.commit(token, now)
-            self._start_waiting(now)
-            self.play(intake, token, now)
+        if token == self._intake.committed:  # a repetition
+            return self._set_reply(token, is_played=True)
+        taken = self._intake.take(part, now)
+        if taken.missing is not None:
+            return self._set_reply(token, missing=taken.missing)
+        if not part["now"]:
+            return self._set_reply(token, is_staged=True)
+        self._intake.commit(token, now)
+        self._start_waiting(now)
+        self.play(taken.layers, token, now)
+        return self._set_reply(token, is_played=True)
+
+    def _set_reply(
+        self, token: int, *, is_staged: bool = False, is_played: bool = False, missing: int = 0
+    ) -> Values:
+        """Return the values of the reply to a set; missing: the first part that is missing."""
+        is_complete = is_staged or is_played
         return {
             "token": token,
-            "exact": not (is_missing or self.is_derated),
+            "exact": is_complete and not self.is_derated,
             "staged": is_staged,
-            "played": not (is_missing or is_staged),
-            "missing": intake if is_missing else 0,
+            "played": is_played,
+            "missing": missing,
         }
 
     def _play_when(self, layers: Layers, commit: Values, now: float) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
@@ -21,13 +22,15 @@ _TEMPERATURES: dict[_Edge, float] = {
 
 
 class AmplifierDevice:
-    """An amplifier of a bench by name, in place of an `Amplifier`, with its faults.
+    """An amplifier of a bench on a wire, with its injected faults.
 
-    Requests advance the bench, and their changes move its plate. In a storm of Naks it rejects all
-    requests except Hello. address: on its wire, from 1; plug_listeners: called when the wire is
-    unplugged (False) and plugged in again (True); boot_listeners: called when its supply is back;
-    listeners: called with the values of every Event, and its time [s]. Uses the time of the running
+    It serves requests like a `SimulatedAmplifier`; they advance the bench and move its plate. The
+    fault `nak_storm` rejects all requests except Hello. Faults happen by the time of the running
     event loop.
+
+    address: on its wire, from 1. plug_listeners: called when the wire is unplugged (False) or
+    plugged in again (True). boot_listeners: called when its supply is back. listeners: called with
+    the values of every Event, and its time [s].
     """
 
     def __init__(
@@ -88,9 +91,7 @@ class AmplifierDevice:
 
     def restart(self, moment: float) -> None:
         """Power-cycle it at a time [s]."""
-        self._bench.advance(moment)
-        self._amplifier.restart(moment)
-        self._bench.advance(moment)
+        self._bench.change(moment, partial(self._amplifier.restart, moment))
 
     def start(self) -> None:
         """Schedule the fault windows, in the running event loop."""
@@ -111,7 +112,7 @@ class AmplifierDevice:
         active = [window for window in self.faults.windows if window.at <= over < window.end]
         self.faults.windows = ()
         for window in active:
-            self._handle_edge(window.model_copy(update={"lasts": over - window.at}), "end")
+            self._handle_edge(window, "end")
 
     def close(self) -> None:
         """Cancel the scheduled faults."""
@@ -135,10 +136,13 @@ class AmplifierDevice:
                 self._timers.append(loop.call_later(delay, self._handle_edge, window, edge))
 
     def _handle_edge(self, window: FaultWindow, edge: _Edge) -> None:
-        """Apply an edge (begin, half, end) of a fault window."""
+        """Apply an edge (begin, half, end) of a fault window now."""
         now = threads.now()
-        self._bench.advance(now)
-        match window.fault, edge:
+        self._bench.change(now, partial(self._apply_edge, window.fault, edge, now))
+
+    def _apply_edge(self, fault: str, edge: _Edge, now: float) -> None:
+        """Change the wire or the amplifier according to an edge of a fault at a time [s]."""
+        match fault, edge:
             case "unplug", "begin":
                 self._unplugged += 1
                 if self._unplugged == 1:
@@ -152,13 +156,12 @@ class AmplifierDevice:
             case "reboot", "end":
                 for on_boot in self.boot_listeners:
                     on_boot()
-            case ("over_voltage" | "arc" | "over_current" | "channel") as fault, "begin":
+            case (("over_voltage" | "arc" | "over_current" | "channel"), "begin"):
                 self._amplifier.trip(fault.upper(), now)
             case "interlock", "begin" | "end":
                 self._amplifier.set_interlock(now, is_open=edge == "begin")
             case "over_temperature", _:
                 self._amplifier.set_temperature(_TEMPERATURES[edge], now)
-        self._bench.advance(now)
 
     def _plug(self, *, is_plugged: bool) -> None:
         for on_plug in [*self.plug_listeners]:

@@ -118,9 +118,8 @@ class Bench:
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._ended_outputs: deque[_Output] = deque()
 
-    @property
-    def fingers(self) -> PlateFingers:
-        """The fingers, with their vibration up to the current time."""
+    def sample_fingers(self) -> PlateFingers:
+        """Advance the plate to the current time; returns the fingers with their vibration."""
         self._sample_plate()
         return self._fingers
 
@@ -129,6 +128,12 @@ class Bench:
         self._advance(now)
         if self.time - self._sampled_until >= _MAX_BEHIND:
             self._sample_what_is_solved()
+
+    def change(self, now: float, change: Callable[[], object]) -> None:
+        """Advance to a time [s], call a function that changes amplifiers, and move the plate."""
+        self.advance(now)
+        change()
+        self.advance(now)
 
     def _advance(self, now: float) -> None:
         """Advance the amplifiers to a time [s]; the plate may stay behind."""

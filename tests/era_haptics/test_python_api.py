@@ -211,7 +211,7 @@ async def test_amplifiers_play_an_answer_as_the_plate_does(answer: era.Answer) -
         await hosted.group.apply(era.commands_for(RIG, answer))
         await hosted.beat_until(threads.now() + 4)
         hosted.bench.advance(threads.now())
-        records = hosted.bench.fingers.felt(threads.now() - 0.5, threads.now())
+        records = hosted.bench.sample_fingers().felt(threads.now() - 0.5, threads.now())
     for number, record in enumerate(played.records):
         here, there = (
             np.sqrt((each.accelerations[-5000:] ** 2).mean(axis=0))

@@ -41,7 +41,7 @@ def phases(bench: Bench, times: tuple[float, ...], *frequencies: float) -> np.nd
     found = []
     for time in times:
         keep_alive(bench, time)
-        (record,) = bench.fingers.felt(time - 0.5, time).values()
+        (record,) = bench.sample_fingers().felt(time - 0.5, time).values()
         samples = record.accelerations[:, 0]
         found.append([np.angle(lock_in(record.times, samples, each)) for each in frequencies])
     return np.array(found)
@@ -165,7 +165,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     bench.advance(86_400.0)
     felt = bench.felt(86_400.0 - 9.9, 86_400.0)
     assert felt["a"].peak.max() < 1e-9
-    assert bench.fingers.felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
+    assert bench.sample_fingers().felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
 
 
 A, B = (0.1, 0.07), (0.29, 0.2)
@@ -219,7 +219,7 @@ def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
     keep_alive(bench, 1.0)
     bench.place_fingers({**sensor, "b": B}, now=1.0, observers=sensor)
     keep_alive(bench, 4.0)
-    recording = bench.fingers.felt(0.0, 4.0)["P1"]
+    recording = bench.sample_fingers().felt(0.0, 4.0)["P1"]
     np.testing.assert_allclose(np.diff(recording.times), 1e-4, rtol=1e-6)
     late = recording.times > 3.5
     amplitude = abs(lock_in(recording.times[late], recording.accelerations[late, 0], FREQUENCY))

@@ -226,7 +226,7 @@ async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> 
     reply = await execute(SimulationContext(bench), line, now=1.0)
     assert reply.keys() == {"error"}
     assert len(reply["error"]) < 300
-    assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}
+    assert bench.sample_fingers().layout.positions == {"a": (0.1, 0.1)}
 
 
 async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_path: Path) -> None:

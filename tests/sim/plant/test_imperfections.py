@@ -64,7 +64,7 @@ def played(
         for name in commands:
             bench.exchange(name, "Stop", {"ramp": 10}, now=stop)
     keep_alive(bench, until)
-    (record,) = bench.fingers.felt(0.0, until).values()
+    (record,) = bench.sample_fingers().felt(0.0, until).values()
     return record.times, record.accelerations[:, 0]
 
 

@@ -640,7 +640,7 @@ class Streamed(Chain):
 
     def _recorded(self, since: float, until: float) -> Recording:
         """Readings of the sensors in a window [s]."""
-        records = self.far.bench.fingers.felt(since, until)
+        records = self.far.bench.sample_fingers().felt(since, until)
         centres = [records[name].accelerations[:, 0] for name in SENSORS]
         return Recording(records["P1"].times, np.stack(centres, axis=1))
 

@@ -550,7 +550,7 @@ class Hands(Acted, Fingers):
         now, bench = threads.now(), self.far.bench
         bench.advance(now)
         found = dict[int, float]()
-        for id, record in bench.fingers.felt(now - 0.5, now).items():
+        for id, record in bench.sample_fingers().felt(now - 0.5, now).items():
             envelope = np.abs(hilbert(record.accelerations @ record.weights))[200:-200]
             times = np.arange(len(envelope)) / bench.sample_rate
             part = envelope * np.hanning(len(envelope))
@@ -710,7 +710,7 @@ class _Starts(Chain):
         bench.advance(now)
         for start in self.starts:
             applied = min(self.applied, key=lambda each: abs(each.time - start))
-            record = bench.fingers.felt(start, now)[finger]
+            record = bench.sample_fingers().felt(start, now)[finger]
             felt.append(
                 Felt(
                     start - touched,

@@ -11,6 +11,12 @@ Only `Group` changes its state. A dash means that the state stays the same:
 
 If a stop comes while amplifiers are opened, they are STOPPED once open.
 
+The state does not follow from the amplifiers' statuses, because a stop must end playback before any
+reply. It does not follow from the daemon's state, because the control loop stops amplifiers before
+the daemon is notified, and programs without a daemon drive amplifiers too. Nor can it replace the
+daemon's state, which is kept while all lines are closed. docs/architecture.md shows which states of
+the daemon and the group belong together.
+
 `Group` classifies an error as a `Failure` once, and then follows `REACTIONS`.
 """
 

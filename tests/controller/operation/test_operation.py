@@ -7,6 +7,7 @@ same, and never too little.
 
 import asyncio
 import random
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import product
@@ -59,6 +60,7 @@ STEPS: Sequence[Step] = (
 """What happens to a plate and its amplifiers, at random: reached, lost, exchanged, loud or mute."""
 PAUSES = (0.0, 0.003, 0.02, 0.1, 0.3, 1.2)
 SILENT = "confirmed_silent"
+ROOT = Path(__file__).parents[3]
 
 
 def said_by_status(daemon: Watched) -> Mapping[str, Mapping[str, object]]:
@@ -84,6 +86,27 @@ def said_by_status(daemon: Watched) -> Mapping[str, Mapping[str, object]]:
     return said
 
 
+def _read_group_states() -> Mapping[str, set[str]]:
+    """Read the states of the group for each state of the daemon, from the architecture page."""
+    states = {}
+    for line in (ROOT / "docs/architecture.md").read_text(encoding="utf-8").splitlines():
+        words = [set(re.findall("`([A-Z_]+)`", cell)) for cell in line.split("|")[1:-1]]
+        if len(words) == 2 and all(words):
+            states.update(dict.fromkeys(words[0], words[1]))
+    return states
+
+
+GROUP_STATES = _read_group_states()
+
+
+def check_agreement(daemon: Watched) -> None:
+    """Require that the group has a state of the page's table once nothing is under way."""
+    supervisor, group = daemon.supervisor, daemon.controller.group
+    assert GROUP_STATES.keys() == {*DaemonState}
+    if not supervisor.tasks and not group.members.disarming:
+        assert group.state.name in GROUP_STATES[daemon.state]
+
+
 def check_enough(daemon: Watched, said: Mapping[str, Mapping[str, object]]) -> None:
     """Require that what plays, or is armed, is said to."""
     for each in daemon.far_ends:
@@ -105,6 +128,7 @@ def test_stop_and_status_agree_and_say_enough(wire: str, seed: int) -> None:
                     await daemon.take(rng.choice(STEPS))
                 await daemon.waits(rng.choice(PAUSES) * rng.random())
                 check_enough(daemon, said_by_status(daemon))
+                check_agreement(daemon)
                 if rng.random() < 0.5:
                     continue
                 stopped = await daemon.supervisor.stop("a test")
@@ -120,6 +144,7 @@ def test_stop_and_status_agree_and_say_enough(wire: str, seed: int) -> None:
                 check_enough(daemon, words)
             daemon.obey()
             await daemon.waits(8)  # all are reached again, however long the last pause
+            check_agreement(daemon)
 
     run_virtual(course(), rng=rng)
 

@@ -129,8 +129,8 @@ class Amplifier:
     """Session of the last Arm."""
     may_be_armed: bool = False
     """Whether it may have carried out an Arm of this host since it was last disarmed."""
-    _stops_before_arm: int = 0
-    """`stops_sent` when Arm was requested: a later stop prevents it."""
+    _disarms_before_arm: int = 0
+    """`disarms_sent` when Arm was requested: a later stop or disarm prevents it."""
     _arms_until: float = -math.inf
     """Until when the requested Arm may go out [s]."""
     feeding: Feeding
@@ -142,7 +142,7 @@ class Amplifier:
     played_at: float = -math.inf
     """Earliest start [s] of the last set sent, or the time when silence was sent."""
     _starts_at: float = -math.inf
-    """Start time [s] of the staged set if committed next; a time in the past: immediately."""
+    """Start [s] of the staged set by the next commit; a time in the past: immediately."""
     committed: int = 0
     """Token of the set that it committed last; 0 if it committed none since it was armed."""
     _ledger: Ledger | None = None
@@ -155,8 +155,8 @@ class Amplifier:
     """What its last stop, Clear or Arm shows about the end of its playback."""
     no_reply_cause: str | None = None
     """Why it is degraded: it did not reply to a request, and may still play."""
-    stops_sent: int = 0
-    """Number of stops and disarms that were sent to it."""
+    disarms_sent: int = 0
+    """Number of disarms, including stops, that were sent to it."""
     _stop: PendingStop | None = None
     """The last stop, which later callers join until it was sent."""
 
@@ -269,16 +269,18 @@ class Amplifier:
         """Return how long sets to all amplifiers of the line take [s]."""
         return len(self.line.members) * self.exchange_time("Set")
 
-    def set_start(self, moment: float | None) -> None:
-        """Set when the staged set starts [s] once it is committed; None: immediately."""
-        self._starts_at = -math.inf if moment is None else moment
+    def expect_commit(self, starts_at: float | None) -> None:
+        """Expect a commit that starts the staged set at a time [s]; None: immediately."""
+        self._starts_at = -math.inf if starts_at is None else starts_at
 
-    def commit(self, token: int, at: int) -> asyncio.Future[Values]:
+    def commit(self, token: int, at: int, starts_at: float | None) -> asyncio.Future[Values]:
         """Play the staged set; returns a future of the status, which shows the tokens.
 
-        at: high word of the amplifier's clock at which it starts. The future raises Preempted if a
-        stop or disarm came first, CommandRefused if it is too late for the ledger's admission.
+        at: high word of the amplifier's clock at which it starts; starts_at: that moment [s], None
+        for an immediate start. The future raises Preempted if a stop or disarm came first,
+        CommandRefused if it is too late for the ledger's admission.
         """
+        self.expect_commit(starts_at)
         values = {"session": self.session, "token": token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 
@@ -298,7 +300,7 @@ class Amplifier:
         if the set is no longer admitted, and CommandRefused if it is too late.
         """
         message = REQUESTS[name]
-        if message.silences or not message.feeds:
+        if message.ends_playback or not message.feeds:
             return
         is_repeated = message is _COMMIT and values["token"] == self.committed
         now = self._time()
@@ -319,7 +321,7 @@ class Amplifier:
 
     def _check_may_arm(self, now: float) -> None:
         """Raise Preempted or LinkTimeout if a requested Arm must not be sent any more."""
-        if self.stops_sent != self._stops_before_arm:
+        if self.disarms_sent != self._disarms_before_arm:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         if now > self._arms_until:  # this machine slept, and the caller does not expect it now
             raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
@@ -335,12 +337,12 @@ class Amplifier:
             self._note_possible_feeding(message, values, now, arrives)
         elif message.disarms:
             self.feeding.note_ramp(_RAMP.from_wire(values["ramp"]))
-            self.stops_sent += 1
+            self.disarms_sent += 1
         if message.arms:
             self._sets.withdraw()
             self.may_be_armed = True
             self.playback_bound.note_armed()
-        elif message.silences:
+        elif message.ends_playback:
             self._sets.withdraw()
             if not message.disarms and self._ledger is not None:
                 self.played_at = now
@@ -352,7 +354,7 @@ class Amplifier:
         self, message: Message, values: Values, now: float, arrives: float
     ) -> None:
         """Note a request that feeds the watchdog if it arrives."""
-        if message.silences and self.no_reply_cause is not None:
+        if message.ends_playback and self.no_reply_cause is not None:
             self.feeding.note_repeated_silence(now, _RAMP.from_wire(values["ramp"]))
         else:
             self.feeding.note_sent(now, arrives)
@@ -420,8 +422,8 @@ class Amplifier:
         for kind in reports_of(status, self.clock.problem(now)):
             self._note_report(kind, now)
         ledger = self._ledger
-        if ledger is not None and message.silences:
-            ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
+        if ledger is not None and message.ends_playback:
+            ledger.note_ended(_RAMP.from_wire(values["ramp"]), sent_at, now)
             self.committed = status["token"]
             return
         # A set plays some time after its commit. An earlier status may show that it plays, but not
@@ -570,7 +572,7 @@ class Amplifier:
         Identifies the amplifier again, because it may have lost power and returned with other
         limits. A stop or disarm that comes after this call goes first, even before it is awaited.
         """
-        self._stops_before_arm = self.stops_sent
+        self._disarms_before_arm = self.disarms_sent
         self._arms_until = threads.now() + _ARM_WITHIN
         return self._arm(session, watchdog)
 
@@ -670,12 +672,12 @@ class Amplifier:
 
         Identifies the amplifier again: after a loss of power it counts latches from 1.
         """
-        last_stops_sent = self.stops_sent
+        last_disarms_sent = self.disarms_sent
         last_latch = self.latch
         status = await self.identify(timeout=REPLY_TIMEOUT)
         has_restarted = last_latch is None or is_newer_token(last_latch, status["latch"])
         latch = status["latch"] if has_restarted else last_latch
-        if self.stops_sent != last_stops_sent:
+        if self.disarms_sent != last_disarms_sent:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         self.playback_bound.note_cleared()
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)

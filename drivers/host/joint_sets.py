@@ -271,17 +271,15 @@ class JointSets:
             await _wait_until_free([*by_line], until=deadline)
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
         words = _start_words(moment, [*staged_sets])
-        for amplifier in staged_sets:
-            amplifier.set_start(moment)
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
         for line, line_amplifiers in by_line.items():
             line_words = {words[amplifier] for amplifier in line_amplifiers}
             if len(line_amplifiers) == 1 or len(line_words) > 1:  # a clock is not steered
                 for amplifier in line_amplifiers:
-                    requests[amplifier] = amplifier.commit(token, words[amplifier])
+                    requests[amplifier] = amplifier.commit(token, words[amplifier], moment)
                 continue
-            make = partial(commit_of, line_amplifiers, token, line_words.pop())
+            make = partial(_joint_commit, line_amplifiers, token, line_words.pop(), moment)
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for amplifier in line_amplifiers:
                 # A heartbeat confirms the broadcast, and feeds the watchdog meanwhile.
@@ -398,6 +396,19 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
     )
 
 
+def _joint_commit(
+    amplifiers: Sequence[Amplifier], token: int, at: int, starts_at: float | None
+) -> list[Values]:
+    """Return a commit of the staged sets of several amplifiers of a line; see `commit_of`.
+
+    starts_at: when the sets start [s]; None: immediately.
+    """
+    messages = commit_of(amplifiers, token, at)
+    for amplifier in amplifiers:
+        amplifier.expect_commit(starts_at)
+    return messages
+
+
 def commit_of(amplifiers: Sequence[Amplifier], token: int, at: int) -> list[Values]:
     """Return a commit for several amplifiers of a line; raises unless it is allowed for all."""
     values = {"session": amplifiers[0].session, "token": token, "at": at}
@@ -413,8 +424,8 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
     token, the commit is repeated once. The ledger compares what its layers play with each status.
     """
     if amplifier.committed != token and status["state"] not in LATCHED:
-        amplifier.set_start(None)
-        status = await amplifier.commit(token, word_passed_by_all(threads.now(), [amplifier]))
+        word = word_passed_by_all(threads.now(), [amplifier])
+        status = await amplifier.commit(token, word, None)
     if amplifier.committed != token or status["state"] in LATCHED:
         raise CommandRefused(
             f"amplifier {amplifier.name}: token must be {token} while armed, got "

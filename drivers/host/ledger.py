@@ -232,8 +232,8 @@ class Ledger:
             if self.limits.frequency_min <= played.frequency <= self.limits.frequency_max:
                 self._rounding.achieved[command.channel, command.frequency] = played.frequency
 
-    def silenced(self, ramp: float, sent_at: float, now: float) -> None:
-        """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
+    def note_ended(self, ramp: float, sent_at: float, now: float) -> None:
+        """Note that all layers end along a ramp [s], by a request sent at a time [s]."""
         self.doubt = None
         self.may_be_silent = set()
         self.lag = max(self.lag, now - sent_at)
@@ -339,20 +339,29 @@ class Ledger:
     def _silence(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
     ) -> tuple[LayerSet, ...]:
-        """Return silent layers with ramps cut to the time that is left, endings only if safe."""
+        """Return silent layers, which are never refused, with ramps cut to the time that is left.
+
+        Voices of a silent layer end along their own endings, which may rise before they fall. If
+        their sums could exceed a limit, or are unknown because a set is in doubt, commands of level
+        0 on all channels skip the endings: every voice then falls along the ramp of its layer.
+        """
         left = math.floor(min(self._budget.fade_left(now), _RAMP.high) * _RAMP.per_unit)
-        silent = tuple([replace(layer, ramp=min(layer.ramp, left)) for layer in layers])
-        try:
-            if self.doubt is None:
-                self._check_sums(silent, now, delay)
-                return silent
-        except CommandRefused:
-            pass
+        silent_layers = tuple([replace(layer, ramp=min(layer.ramp, left)) for layer in layers])
+        if self.doubt is None and self._are_sums_within(silent_layers, now, delay):
+            return silent_layers
         commands = []
         for channel in range(self.capabilities["channels"]):
             frequency = self.limits.frequency_min
             commands.append(Command(channel, frequency, 0, 0, skip_ending=True))
-        return tuple([replace(layer, commands=tuple(commands)) for layer in silent])
+        return tuple([replace(layer, commands=tuple(commands)) for layer in silent_layers])
+
+    def _are_sums_within(self, layers: Sequence[LayerSet], now: float, delay: float) -> bool:
+        """Whether level, power and rise surely stay within their limits."""
+        try:
+            self._check_sums(layers, now, delay)
+        except CommandRefused:
+            return False
+        return True
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
         """Raise CommandRefused if level, power or rise may exceed its limit."""

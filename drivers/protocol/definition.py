@@ -262,8 +262,8 @@ class Message:
     """Whether it feeds the watchdog."""
     plays: bool = False
     """Whether it stages or starts a set, which the ledger must have admitted."""
-    silences: bool = False
-    """Whether it ends all playback."""
+    ends_playback: bool = False
+    """Whether all channels ramp to zero."""
     changes_state: bool = False
     """Whether it can change the state; an event may then come before the reply."""
 
@@ -275,7 +275,7 @@ class Message:
     @property
     def disarms(self) -> bool:
         """Whether it switches the high voltage off after the ramp."""
-        return self.silences and self.changes_state
+        return self.ends_playback and self.changes_state
 
     @property
     def shows_clock(self) -> bool:
@@ -321,11 +321,13 @@ _SILENCE = _record("session", "ramp")
 _MESSAGES = (
     Message("GetCaps", 2, _NOTHING, _CAPABILITIES),
     Message("Arm", 3, _ARM, STATUS, feeds=True, changes_state=True),
-    Message("Disarm", 4, _ANY_RAMP, STATUS, silences=True, changes_state=True),
+    Message("Disarm", 4, _ANY_RAMP, STATUS, ends_playback=True, changes_state=True),
     Message("Set", 5, _SET, _TAKEN, feeds=True, plays=True),
     Message("Commit", 6, _COMMIT, STATUS, is_broadcast=True, feeds=True, plays=True),
-    Message("Silence", 7, _SILENCE, STATUS, feeds=True, silences=True),
-    Message("Stop", 8, _ANY_RAMP, STATUS, is_broadcast=True, silences=True, changes_state=True),
+    Message("Silence", 7, _SILENCE, STATUS, feeds=True, ends_playback=True),
+    Message(
+        "Stop", 8, _ANY_RAMP, STATUS, is_broadcast=True, ends_playback=True, changes_state=True
+    ),
     Message("GetStatus", 9, _NOTHING, STATUS),
     Message("GetFaults", 10, _NOTHING, _FAULTS),
     Message("Clear", 11, _record("latch"), STATUS, changes_state=True),

@@ -430,7 +430,7 @@ def test_what_a_commit_may_leave_playing_if_it_comes_late_counts(name: str) -> N
     ledger, at = Ledger(WIDE, {**CAN, "voices": 8}), 0.0
     for token, (at, layer) in enumerate(LATE[name], 1):
         if layer is None:
-            ledger.silenced(0.06, at, at + 0.01)
+            ledger.note_ended(0.06, at, at + 0.01)
         else:
             ledger.sent(token, ledger.admit([layer], at), at)
             ledger.resolve(token, at + 0.01)

@@ -17,20 +17,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.evdev import (
+from controller.sources.evdev import EvdevSource
+from controller.sources.input_device import (
     CLOCK,
     GRAB,
     PRESSED_KEYS,
-    EvdevSource,
     InputDevice,
     InputEvent,
-    SlotReader,
-    SlotState,
     as_slot_event,
     eviocgabs,
     eviocgmtslots,
     parse_events,
 )
+from controller.sources.slot_reader import SlotReader, SlotState
 from controller.sources.touch import TouchFrame
 from kit.clock import run_virtual
 from model.errors import InputError
@@ -301,7 +300,7 @@ def kernel(
         resolution = {0x35: 12, 0x3A: 3}.get(axis, 0)
         return struct.pack("6i", axis, 0, highs.get(axis, width), 0, 0, resolution)
 
-    monkeypatch.setattr("controller.sources.evdev.fcntl.ioctl", ioctl)
+    monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
 
 
 BUSY = OSError(errno.EBUSY, "Device or resource busy")

@@ -1,4 +1,4 @@
-"""The gateway's routes and process: page, API over HTTP with OpenAPI, WebSocket and metrics.
+"""The gateway's routes and process: page, API over HTTP, WebSocket and metrics.
 
 `Gateway` holds the routes, `serve` runs them in aiohttp until SIGINT or SIGTERM and ends within a
 second.
@@ -21,13 +21,10 @@ from aiohttp import HttpVersion11, WSCloseCode, web
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 from prometheus_client import CONTENT_TYPE_LATEST
-from pydantic.json_schema import models_json_schema
 
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import (
-    ERROR_MEANINGS,
     ErrorCode,
-    ErrorData,
     RpcError,
     error_line,
     parse_json,
@@ -36,10 +33,9 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.link import RESPONSE_TIMEOUT, Unreachable
-from controller.api.methods import METHODS, SILENCING, Method
-from controller.api.schema import API_VERSION, ApiMessage
+from controller.api.methods import METHODS, SILENCING
+from controller.api.schema import ApiMessage
 from controller.api.silencing import readable_params
-from controller.api.summaries import SUMMARIES
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import MAX_READ_FRAME, BrowserSocket, bridge
 from controller.gateway.connections import (
@@ -51,6 +47,7 @@ from controller.gateway.connections import (
 from controller.gateway.field import DrawnField
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
+from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
 from controller.process.daemon_process import allow_many_descriptors
 from model.errors import InputError
 from registry.threads import no_long_collections, stop_accepting
@@ -71,106 +68,6 @@ _QUEUE = 512  # connections that wait to be accepted
 _ACCEPTED = 4  # connections per iteration of the event loop
 _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to finish
-
-HTTP_METHODS = {name: method for name, method in METHODS.items() if method.over_http}
-"""Methods available over HTTP: notifications need a WebSocket."""
-
-HTTP_STATUS = {
-    ErrorCode.PARSE: 400,
-    ErrorCode.INVALID_REQUEST: 400,
-    ErrorCode.UNKNOWN_METHOD: 404,
-    ErrorCode.INVALID_PARAMS: 422,
-    ErrorCode.INTERNAL: 500,
-    ErrorCode.WRONG_STATE: 409,
-    ErrorCode.LEASE: 409,
-    ErrorCode.REFUSED: 409,
-    ErrorCode.LINK: 503,
-    ErrorCode.BUSY: 429,
-    ErrorCode.NOT_SILENT: 503,
-}
-"""HTTP status of each error of the API."""
-
-_GATEWAY_ERRORS = {
-    400: "the body is not a JSON object",
-    401: "the token is missing or wrong",
-    403: "the origin is not allowed",
-    413: "the body is too large",
-    415: "the content type is not application/json",
-    421: "the Host header does not name this gateway",
-}
-
-
-class ErrorBody(ApiMessage):
-    """Body of a response with an error status."""
-
-    error: str
-    code: int | None = None
-    data: ErrorData | None = None
-
-
-def openapi() -> dict[str, Any]:
-    """Return the OpenAPI 3.1 description of the API."""
-    params: set[type[ApiMessage]] = set()
-    results: set[type[ApiMessage]] = {ErrorBody}
-    for method in HTTP_METHODS.values():
-        params.add(method.params)
-        results.add(method.result)
-    references, definitions = models_json_schema(
-        [
-            *((model, "validation") for model in sorted(params, key=repr)),
-            *((model, "serialization") for model in sorted(results, key=repr)),
-        ],
-        ref_template="#/components/schemas/{model}",
-    )
-    paths = {}
-    for name, method in HTTP_METHODS.items():
-        paths[f"/api/v1/{name}"] = {"post": _operation(name, method, references)}
-    return {
-        "openapi": "3.1.0",
-        "info": {
-            "title": "era-haptics gateway",
-            "version": API_VERSION,
-            "description": (
-                "The daemon's API over HTTP. The WebSocket /api/v1/ws has the same methods and "
-                "notifications, see docs/reference/gateway.md. This is an operational interface, "
-                "not an emergency stop."
-            ),
-        },
-        "security": [{"token": []}],
-        "paths": paths,
-        "components": {
-            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
-            "schemas": definitions["$defs"],
-        },
-    }
-
-
-def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
-    """Return the request and responses of a method."""
-    errors = dict(_GATEWAY_ERRORS)
-    for code, status in HTTP_STATUS.items():
-        meaning = ERROR_MEANINGS[code]
-        errors[status] = f"{errors[status]}; {meaning}" if status in errors else meaning
-    success = _json_content(references[method.result, "serialization"])
-    failure = _json_content(references[ErrorBody, "serialization"])
-    responses: dict[str, Any] = {"200": {"description": "done", "content": success}}
-    for status, meaning in sorted(errors.items()):
-        responses[str(status)] = {"description": meaning, "content": failure}
-    fields = method.params.model_fields.values()
-    return {
-        "operationId": name,
-        "summary": SUMMARIES[name],
-        "requestBody": {
-            "required": any(field.is_required() for field in fields),
-            "content": _json_content(references[method.params, "validation"]),
-        },
-        "responses": responses,
-    }
-
-
-def _json_content(schema: Any) -> dict[str, Any]:
-    """Return the description of a body in JSON."""
-    return {"application/json": {"schema": schema}}
 
 
 class Gateway:

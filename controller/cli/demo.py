@@ -127,7 +127,7 @@ def _print_result(
     as_json: bool,
 ) -> None:
     """Draw the pictures of a run and print its result; exit with status 1 if it is void."""
-    from controller.demo.demonstration import write_pictures
+    from controller.demo.demo_pictures import write_pictures
 
     report["touches"] = [row.as_json() for row in run.rows]
     if run.why_void is not None:

@@ -15,11 +15,11 @@ from unittest.mock import AsyncMock
 import numpy as np
 import pytest
 
-from controller.demo import demonstration
+from controller.demo import demo_pictures, demonstration
 from controller.demo import simulated_plate as far_end
+from controller.demo.demo_pictures import Pictures
 from controller.demo.demonstration import (
     DemoRun,
-    Pictures,
     Scene,
     example_scenes,
     run_demo,
@@ -217,7 +217,7 @@ def demo(
     def write_pictures(table: object, rows: object, out: Path) -> Pictures:
         return Pictures([out / "t.png"], ["no contents.png: WHY"])
 
-    monkeypatch.setattr(demonstration, "write_pictures", write_pictures)
+    monkeypatch.setattr(demo_pictures, "write_pictures", write_pictures)
     monkeypatch.setattr(table_file, "cached_table", lambda rig, **more: (small_table(), None))
     monkeypatch.chdir(tmp_path)
     shutil.copy(example_rig_path(), "mine.yaml")

@@ -129,7 +129,8 @@ class Controller:
                 too_late=cycle.count_too_late,
                 clock_errors=lambda: self.group.clock_errors,
             )
-            await asyncio.to_thread(planner.prepare)  # takes seconds for a large rig
+            clock_errors = self.group.clock_errors
+            await asyncio.to_thread(planner.precompute, clock_errors)  # seconds for a large rig
         except BaseException as error:
             if not isinstance(error, LinkError):
                 await self.release()

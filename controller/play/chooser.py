@@ -86,7 +86,8 @@ class Chooser:
         for key, content in question.playing.items():
             if key.finger in unlimited.target_keys and content not in pulses:
                 active.append(content)  # fading
-        remaining = self._left_by(active, capabilities)
+        active_layers = [content.layer for content in active]
+        remaining = capabilities.left_by(active_layers, self.table)
         layers = [content.layer for content in unlimited.contents]
         if remaining.limits.factor_within(layers, self.table) >= 1 - NEARLY:
             return unlimited
@@ -104,7 +105,10 @@ class Chooser:
     ) -> Selection:
         """Choose for a short pulse, while active selections play and other contents fade."""
         others = contents_of([*active, question.fading])
-        remaining = self._left_by(others, capabilities)
+        remaining = capabilities
+        if others:
+            other_layers = [content.layer for content in others]
+            remaining = capabilities.left_by(other_layers, self.table)
         raised = (_raised(finger, others),)
         frequencies = set[float]()
         for content in others:
@@ -113,14 +117,6 @@ class Chooser:
         return self._choose(
             question, (finger,), remaining, raised=raised, avoided_hz=[*frequencies]
         )
-
-    def _left_by(
-        self, contents: Sequence[Content], capabilities: PlaybackCapabilities
-    ) -> PlaybackCapabilities:
-        """Return the amplifiers' capabilities with the limits that contents leave."""
-        if not contents:
-            return capabilities
-        return capabilities.left_by([content.layer for content in contents], self.table)
 
     def _choose(
         self,

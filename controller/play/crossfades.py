@@ -189,19 +189,12 @@ def _all_of(voices: _Voices) -> list[Content]:
 
 def _changes(goal: _Voices, playing: _Voices) -> _Voices:
     """Return the contents of a goal that feel different from the present contents."""
-    changes = dict[ContactKey, tuple[Content, ...]]()
-    for key, voices in goal.items():
-        if _differ(voices, playing[key]):
-            changes[key] = voices
-    return changes
+    return {key: voices for key, voices in goal.items() if _differ(voices, playing[key])}
 
 
 def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
     """Return the number of voices and the contacts of each finger's content."""
-    served = {}
-    for key, contents in voices.items():
-        served[key] = (len(contents), {*contents[0].contact_keys})
-    return served
+    return {key: (len(contents), {*contents[0].contact_keys}) for key, contents in voices.items()}
 
 
 def _is_worth_it(goal: Answer, present: Answer, playing: _Voices, changes: _Voices) -> bool:
@@ -217,11 +210,8 @@ def _is_worth_it(goal: Answer, present: Answer, playing: _Voices, changes: _Voic
 def _is_apart(content: Content, neighbours: Iterable[Content]) -> bool:
     """Whether a content is at least 30 Hz from all others."""
     frequency = content.frequency or 0.0
-    for neighbour in neighbours:
-        distance = abs(frequency - (neighbour.frequency or 0.0))
-        if distance < APART_HZ:
-            return False
-    return True
+    distances = [abs(frequency - (neighbour.frequency or 0.0)) for neighbour in neighbours]
+    return min(distances, default=APART_HZ) >= APART_HZ
 
 
 def _is_tuned(playing: Sequence[Content], goal: Sequence[Content]) -> bool:

@@ -508,18 +508,18 @@ class Selection:
         """
         if not self.contents or not any(gains_db.values()):
             return self
-        gains = dict[Targets, float]()
-        for content in self.contents:
-            gains[content.targets] = _lowest_gain(content.targets, gains_db)
+        gains = {
+            content.targets: _lowest_gain(content.targets, gains_db) for content in self.contents
+        }
         contents = list[Content]()
         for content in self.contents:
             gain = gains[content.targets]
             others_gains = [gains[targets] for targets in gains if targets != content.targets]
             contents.append(content.weakened(gain, max(others_gains, default=gain)))
         largest_gain = max(gains.values())
-        foreign_levels = dict[ContactKey, tuple[float, ...]]()
-        for key, levels in self.foreign_levels.items():
-            foreign_levels[key] = _all_amplified(levels, largest_gain)
+        foreign_levels = {
+            key: _all_amplified(levels, largest_gain) for key, levels in self.foreign_levels.items()
+        }
         return replace(self, contents=tuple(contents), foreign_levels=foreign_levels)
 
     def without(self, contents: Collection[Content], reason: str) -> "Selection":

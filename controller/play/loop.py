@@ -9,8 +9,10 @@ import logging
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import ParamSpec
+from enum import Enum, auto
+from typing import ParamSpec, cast
 
+from controller.play.layer_sets import Sets
 from controller.play.planner import Plan, PlanKind, Planner
 from controller.play.reports import Observers, play_report
 from controller.play.slots import RELEASE_RAMP
@@ -38,6 +40,19 @@ IDLE_INTERVAL = 0.5
 _P = ParamSpec("_P")
 
 _logger = logging.getLogger(__name__)
+
+
+class SendFailure(Enum):
+    """Why the sets of a plan do not play, and what plays instead."""
+
+    PREEMPTED_BY_TOUCH = auto()
+    """A touch came before any amplifier played the sets; the former contents continue."""
+    REFUSED = auto()
+    """The amplifiers refused the sets; the former contents continue."""
+    NO_REPLY = auto()
+    """An amplifier does not reply, and none plays the sets; the former contents continue."""
+    UNKNOWN = auto()
+    """Any other error: it is unknown which contents play."""
 
 
 class Cycle:
@@ -131,57 +146,71 @@ class Cycle:
     async def _send(self, planner: Planner, plan: Plan) -> None:
         """Send the changes of a plan, and report the outcome; raises DriverError.
 
-        While an amplifier is degraded nothing starts or is prolonged.
+        While an amplifier is degraded nothing starts or is prolonged. A refused plan is replaced by
+        the planner, once.
         """
         if self.group.members.degraded:
-            plan = planner.only_ends(plan)
+            plan = planner.drop_starts(plan)
         self._plan = plan
         try:
-            outcome = await self._play(planner, plan)
-            if isinstance(outcome, CommandRefused):
-                plan = planner.refused(plan, outcome, now=threads.now())
-                outcome = await self._play(planner, plan)
+            sent_at = await self._play(planner, plan.sets)
+        except BaseException as error:
+            failure = self._failure_of(error, plan.sets)
+            if failure is SendFailure.PREEMPTED_BY_TOUCH:
+                return  # the endings follow the sets of the next plan
+            if failure is not SendFailure.REFUSED:
+                planner.not_played(plan, is_known=failure is SendFailure.NO_REPLY)
+                raise
+            refusal = cast("CommandRefused", error)
+            plan = planner.replace_refused(plan, refusal, now=threads.now())
+            await self._send(planner, plan)
+            return
         finally:
             self._plan = None
         if plan.sets.reason:
             _report(self.observers.refused, plan.sets.reason)
-        if plan.kind is not PlanKind.CHANGE:
-            return
-        sent_at = outcome if isinstance(outcome, float) else None
-        report = play_report(plan, planner.slots.by_layer, sent_at=sent_at, now=threads.now())
-        _report(self.observers.reported, report)
+        if plan.kind is PlanKind.CHANGE:
+            playing = planner.slots.by_layer
+            report = play_report(plan, playing, sent_at=sent_at, now=threads.now())
+            _report(self.observers.reported, report)
 
-    async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
-        """Play the sets of a plan on all amplifiers, from one moment on.
+    def _failure_of(self, error: BaseException, sets: Sets) -> SendFailure:
+        """Classify the exception that ended an attempt to send sets."""
+        if isinstance(error, Overtaken):
+            return SendFailure.PREEMPTED_BY_TOUCH
+        if sets.silence is not None:
+            return SendFailure.UNKNOWN
+        is_refusal = isinstance(error, CommandRefused) and not isinstance(error, Preempted)
+        if is_refusal and self.group.is_armed:
+            return SendFailure.REFUSED
+        if isinstance(error, LinkDegraded) and not self.group.sets.is_in_doubt:
+            return SendFailure.NO_REPLY
+        return SendFailure.UNKNOWN
 
-        Returns when [s] they start, None if nothing is sent, or the refusal. After an exception it
-        is unknown which contents play.
-        """
-        sets = plan.sets
-        if not sets:
-            return None
+    async def _play(self, planner: Planner, sets: Sets) -> float | None:
+        """Play sets, or the silence in their place; return when [s] they start, None if empty."""
+        if sets.silence is not None:
+            return await self._play_silence(planner, sets.silence)
+        if sets.layers:
+            return await self._play_layers(planner, sets)
+        return None
 
-        def is_overtaken_by_touch() -> bool:
+    async def _play_silence(self, planner: Planner, ramp: float) -> float:
+        """Silence all layers along a ramp [s]; return when [s] the last request was sent."""
+        sent_at = await self.group.silence(ramp)
+        planner.slots.layers.confirm_silence()
+        return sent_at
+
+    async def _play_layers(self, planner: Planner, sets: Sets) -> float:
+        """Play layers on all amplifiers from one moment [s] on, which is returned."""
+        if self.group.sets.is_in_doubt:
+            await self.group.silence(RELEASE_RAMP)  # before the next pattern
+
+        def is_preempted_by_touch() -> bool:
             return self._wake.is_set() and threads.now() < sets.preempted_until
 
-        try:
-            if sets.silence is not None:
-                sent_at = await self.group.silence(sets.silence)
-                planner.slots.may_play = frozenset()
-                return sent_at
-            if self.group.sets.is_in_doubt:
-                await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            is_preempted = is_overtaken_by_touch if sets.endings else None
-            played = await self.group.apply(sets.by_amplifier, is_preempted)
-        except Overtaken:  # the endings follow the sets of the next plan
-            return None
-        except BaseException as error:
-            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
-            if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
-                return error
-            is_known = isinstance(error, LinkDegraded) and not self.group.sets.is_in_doubt
-            planner.not_played(plan, is_known=is_known and sets.silence is None)
-            raise
+        is_preempted = is_preempted_by_touch if sets.updates else None
+        played = await self.group.apply(sets.by_amplifier, is_preempted)
         planner.confirm(sets, played, now=threads.now())
         return played.starts_at
 
@@ -213,7 +242,7 @@ class Cycle:
             raise CommandError("controller must be open; call open() first")
         self._is_newly_armed = True
         if not was_armed:
-            self.planner.slots.may_play = frozenset()
+            self.planner.slots.layers.confirm_silence()
         self.planner.replace_limits(limits)
         self._schedule_expiry()  # fingers may have rested since before
         self.feed_at_once()
@@ -254,7 +283,7 @@ class Cycle:
         planner = self.planner
         self._wake.set()
         if change.up and planner is not None:  # else the amplifiers were never open
-            planner.note_lifts(change.up)
+            planner.count_unplanned_lifts(change.up)
             if planner.is_silence_pending:
                 self.group.abort_exchange()
         _report(self.observers.contacts_changed, self.tracker.contacts, change)
@@ -295,8 +324,8 @@ class Cycle:
             until = min(until, self.planner.due)
         if self.group.is_armed:
             until = min(until, self._heartbeat_due, self.group.members.lost_from)
-            if self.planner is not None and now < self.planner.slots.ending_due:
-                until = min(until, self.planner.slots.ending_due)
+            if self.planner is not None and now < self.planner.slots.update_due:
+                until = min(until, self.planner.slots.update_due)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

@@ -2,12 +2,13 @@
 
 plan(now):  contacts -> intent -> selection of contents -> sets of layers
 
-The planner reads no clock and never waits. `controller.play.loop` sends its plans.
+The planner never waits. `controller.play.loop` sends its plans, and reports to the planner whether
+the amplifiers play them.
 """
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from functools import partial
@@ -15,9 +16,11 @@ from functools import partial
 from controller.play.changes import ChangeTimes, WaitingChanges
 from controller.play.chooser import Chooser
 from controller.play.intent import IntentSource, Pulse, Selection, no_layer_free
+from controller.play.layer_sets import Sets
 from controller.play.routing import CountedClocks, PlaybackCapabilities
 from controller.play.selection import Selector
-from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
+from controller.play.slot import Slot
+from controller.play.slots import RELEASE_RAMP, RETRY, Check, Slots
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Contact
 from drivers.errors import CommandRefused
@@ -81,10 +84,9 @@ class Plan:
 class Planner:
     """Plans the vibrations for the contacts on one plate; synchronous, times are arguments.
 
-    A plan never raises: it falls back to silence on any exception. check: queries the ledgers;
-    arrived: called when contents have been chosen in the thread; it calls `look_again` and plans;
-    too_late: called with the number of clicks that came too late to be felt; clock_errors: returns
-    the clock errors of the amplifiers by name, rms [s].
+    check: queries the ledgers; arrived: called when contents have been chosen in the thread; it
+    calls `look_again` and plans; too_late: called with the number of clicks that came too late to
+    be felt; clock_errors: returns the clock errors of the amplifiers by name, rms [s].
     """
 
     def __init__(
@@ -106,12 +108,13 @@ class Planner:
         self._tracker = tracker
         self._intent_source = intent_source
         self._count_too_late = too_late
+        self._timing = timing
         self.slots = Slots(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
         """The contents of all layers."""
         self.clocks = CountedClocks(rig, clock_errors)
         """Clock errors of the amplifiers, as the table includes them."""
         self._selector = Selector(
-            self._chooser_of(table), arrived=arrived, may_lead=self.slots.may_lead
+            self._chooser_of(table), arrived=arrived, can_crossfade=self.slots.can_crossfade_to
         )
         self._intent_due = math.inf  # s; when the intent may change without a touch
         self._retry_at = math.inf  # s; when a ledger may admit a refused set
@@ -137,74 +140,86 @@ class Planner:
 
     @property
     def is_silence_pending(self) -> bool:
-        """Whether the last contact has lifted and silence has not been commanded yet."""
-        return not self._tracker.contacts and not self.slots.is_silent
+        """Whether the last contact has lifted and silence has not been planned yet."""
+        return not self._tracker.contacts and not self.slots.is_silence_planned
 
     def plan(self, now: float) -> Plan | None:
-        """Plan at a time [s], after expired contacts were lifted; None if nothing changes."""
-        self._drop_ended_pulses(now)
-        contacts = self._tracker.contacts
-        last_plan = self._last_plan
-        former_slots = self.slots.by_layer
+        """Plan at a time [s], after expired contacts were lifted; None if nothing changes.
+
+        Any exception becomes a plan of silence.
+        """
         try:
-            self._count_clocks_if_due(now)
-            if last_plan is not None and not self._is_due(now):
-                return self._prolonged(last_plan, now)
-            selected = self._select(contacts, now)
-            if last_plan is not None and self._is_planned(selected, now):
-                self._changes.answered_by((), self._selector.pending)
-                return self._prolonged(last_plan, now)
-            self._changes.wait_again_after_refusal()
-            selection, sets = self._playback_of(selected, now)
+            return self._next_plan(now)
         except Exception as error:
-            return self._plan_silence(error, contacts, former_slots, now)
-        self._last_selection = selected
-        if sets is None:  # no content
-            self._retry_at = math.inf
-            is_awaited = selected.is_pending and not self.slots.may_play
-            if is_awaited:
-                plan = self._adopt(contacts, selection, Sets(), former_slots, now)
-                return self._prolonged(plan, now)
-            sets = self._end(contacts, now)
-            return self._adopt(contacts, selection, sets, former_slots, now)
-        self._retry_at = sets.retry_at
-        plan = self._adopt(contacts, selection, sets, former_slots, now)
-        changes_nothing = not sets and _is_felt_alike(plan, last_plan)
+            return self._plan_silence(error, now)
+
+    def _next_plan(self, now: float) -> Plan | None:
+        """Plan the contents for the present contacts and intent; None if nothing changes."""
+        self._drop_ended_pulses(now)
+        self._count_clocks_if_due(now)
+        last_plan = self._last_plan
+        if last_plan is not None and not self._is_due(now):
+            return self._prolonged(last_plan, now)
+        selected = self._select(now)
+        if last_plan is not None and self._is_planned(selected, now):
+            self._changes.answered_by((), self._selector.pending)
+            return self._prolonged(last_plan, now)
+        self._changes.wait_again_after_refusal()
+        self.slots.keep_ended(selected.contents)
+        playable = self._playable(selected)
+        if not playable.contents:
+            return self._plan_end(selected, playable, now)
+        sets = self.slots.plan(playable.contents, now)
+        if sets.skipped:
+            playable = playable.without(sets.skipped, sets.reason)
+        plan = self._adopt(selected, playable, sets, now)
+        changes_nothing = sets.is_empty and _is_felt_alike(plan, last_plan)
         return self._prolonged(plan, now) if changes_nothing else plan
 
-    def _plan_silence(
-        self,
-        error: Exception,
-        contacts: tuple[Contact, ...],
-        former_slots: Mapping[int, Slot],
-        now: float,
-    ) -> Plan | None:
+    def _plan_end(self, selected: Selection, playable: Selection, now: float) -> Plan | None:
+        """Plan the end of all contents; None while the first contents are being chosen."""
+        is_awaited = selected.is_pending and not self.slots.layers.may_play
+        if is_awaited:
+            plan = self._adopt(selected, playable, Sets(), now)
+            return self._prolonged(plan, now)
+        if self._tracker.contacts and self.slots.have_settled(now):
+            sets = self.slots.plan((), now)
+        else:
+            sets = self._silence()
+        return self._adopt(selected, playable, sets, now)
+
+    def _plan_silence(self, error: Exception, now: float) -> Plan | None:
         """Plan silence after a failure; None if the last plan is silence for the same reason."""
         self._selector.due = math.inf
+        failure = Selection((), self._tracker.contacts, reason=failure_text(error))
+        plan = None
+        if self._last_plan is None or failure != self._last_selection:
+            _logger.error("loop: plan failed, silencing all channels", exc_info=error)
+            plan = self._adopt(failure, failure, self._silence(), now)
         self._retry_at = now + HEARTBEAT
-        failure = Selection((), contacts, reason=failure_text(error))
-        if self._last_plan is not None and failure == self._last_selection:
-            return None
-        _logger.error("loop: plan failed, silencing all channels", exc_info=error)
-        self._last_selection = failure
-        sets = self._end(contacts, now, has_failed=True)
-        return self._adopt(contacts, failure, sets, former_slots, now)
+        return plan
 
-    def _adopt(
-        self,
-        contacts: tuple[Contact, ...],
-        selection: Selection,
-        sets: Sets,
-        former_slots: Mapping[int, Slot],
-        now: float,
-    ) -> Plan:
-        """Return the plan for a selection and its sets, and keep it as the last plan."""
-        for pulse in self._pulses_in(sets.started):
-            self._unstarted_pulses[id(pulse)] = pulse
-        started = [self.slots.by_layer[number].content for number in sets.started]
+    def _silence(self) -> Sets:
+        """Return the sets that silence all layers; quickly if no finger is left on the plate."""
+        return self.slots.silence(FADE_RAMP if self._tracker.contacts else RELEASE_RAMP)
+
+    def _adopt(self, selected: Selection, playable: Selection, sets: Sets, now: float) -> Plan:
+        """Make a plan, and take it as the present playback.
+
+        selected: the contents that fingers are to feel; playable: the contents that play then.
+        """
+        former_slots = self.slots.by_layer
+        self.slots.adopt(sets, now)
+        started = [sets.slots[number].content for number in sets.started]
+        for content in started:
+            for pulse in content.pulses:
+                self._unstarted_pulses[id(pulse)] = pulse
         answered = self._changes.answered_by(started, self._selector.pending)
-        plan = Plan(contacts, selection, now, answered, sets, former_slots=former_slots)
+        contacts = self._tracker.contacts
+        plan = Plan(contacts, playable, now, answered, sets, former_slots=former_slots)
         self._last_plan = plan
+        self._last_selection = selected
+        self._retry_at = sets.retry_at
         return plan
 
     def _is_planned(self, selected: Selection, now: float) -> bool:
@@ -224,14 +239,15 @@ class Planner:
         """Count the clocks; while fingers wait for a plan, at most every other heartbeat."""
         if now >= self._clocks_due or not self._tracker.changed:
             self._clocks_due = now + _CLOCKS_INTERVAL
-            self._count_clocks()
+            self._count_clocks(self.clocks.known)
 
     def _is_due(self, now: float) -> bool:
         """Whether fingers have changed, or the time for a new plan [s] has come."""
         return bool(self._tracker.changed) or now >= self.due
 
-    def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
-        """Return the selection for contacts by the present intent, with its strengths."""
+    def _select(self, now: float) -> Selection:
+        """Return the selection for the contacts by the present intent, with its strengths."""
+        contacts = self._tracker.contacts
         self._planned_contacts = contacts
         self._intent_due = math.inf
         fingers = tuple([contact for contact in contacts if not contact.why_load_alone])
@@ -240,63 +256,45 @@ class Planner:
         selection = self._selector.select(contacts, intent, self.capabilities, now=now)
         return selection.weakened(intent.gains_db)
 
-    def _playback_of(self, selected: Selection, now: float) -> tuple[Selection, Sets | None]:
-        """Return the playable part of a selection, and its sets; None if it has no contents."""
-        playable = self._playable(selected)
-        if not playable.contents:
-            return playable, None
-        sets = self.slots.plan(playable.contents, now)
-        if sets.skipped:
-            playable = playable.without(sets.skipped, sets.reason)
-        return playable, sets
-
     def _prolonged(self, plan: Plan, now: float) -> Plan | None:
         """Return a due change while a plan continues: contents have ended, or must be prolonged."""
         if now < self.slots.due:
             return None
-        ended_contents = self.slots.ended(now)
+        ended_contents = self.slots.end_expired(now)
         if ended_contents:
             selection = plan.selection.without(ended_contents, ENDED)
             self._last_plan = replace(
                 plan, selection=selection, sets=Sets(), made_at=now, answered={}
             )
             return self._last_plan
-        renewal = self.slots.renewal(now)
-        if not renewal:
-            return None
-        return replace(plan, sets=renewal, kind=PlanKind.PROLONGATION)
+        for prolonging in (self.slots.endings, self.slots.renewals):
+            sets = prolonging(now)
+            if sets.is_empty:
+                continue
+            refusal = self.slots.refusal_of(sets)
+            if refusal is None:
+                return replace(plan, sets=sets, kind=PlanKind.PROLONGATION)
+            self.slots.put_off(sets, refusal)
+        return None
 
     def _playable(self, selection: Selection) -> Selection:
         """Return a selection without contents that have ended by themselves or have no layer."""
-        ended_contents = self.slots.over_of(selection.contents)
+        ended_contents = self.slots.ended_among(selection.contents)
         if ended_contents:
             selection = selection.without(ended_contents, ENDED)
         layer_count = self.capabilities.layers
         if len(selection.contents) <= layer_count:
             return selection
         # All voices of a content have a layer, or none has.
-        numbered = [*self.slots.numbered(selection.contents).values()]
-        lacking = [content.targets for content in selection.contents if content not in numbered]
+        allocated = [*self.slots.layers.allocate(selection.contents).values()]
+        lacking = [content.targets for content in selection.contents if content not in allocated]
         skipped = [content for content in selection.contents if content.targets in lacking]
         return selection.without(skipped, no_layer_free(layer_count))
 
-    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool = False) -> Sets:
-        """Return the sets that end all contents; along their endings if fingers remain."""
-        if not contacts:
-            return self.slots.silence(RELEASE_RAMP, now)
-        if has_failed or not self.slots.have_settled(now):
-            return self.slots.silence(FADE_RAMP, now)
-        return self.slots.plan((), now)
-
-    def _pulses_in(self, numbers: Iterable[int]) -> list[Pulse]:
-        """Return the pulses that play in layers."""
-        contents = [self.slots.by_layer[number].content for number in numbers]
-        return [pulse for content in contents for pulse in content.pulses]
-
-    def note_lifts(self, up: Sequence[Contact]) -> None:
-        """Note that contacts have lifted."""
+    def count_unplanned_lifts(self, lifted: Sequence[Contact]) -> None:
+        """Count the contacts that have lifted before any plan included them, as too late."""
         planned_keys = {contact.key for contact in self._planned_contacts}
-        unplanned = [contact for contact in up if contact.key not in planned_keys]
+        unplanned = [contact for contact in lifted if contact.key not in planned_keys]
         if unplanned:
             self._count_too_late(len(unplanned))
 
@@ -316,47 +314,45 @@ class Planner:
         The known playback is discarded. If is_known, the former contents still play, except that
         layers ended by the plan may be silent or not; the next plan ends these again.
         """
-        is_change = plan.kind is PlanKind.CHANGE
-        if is_change or not is_known:
-            self.forget()
-        if not is_change:
+        if plan.kind is not PlanKind.CHANGE:
+            if not is_known:
+                self.forget()
             return
+        self.forget()
         self._tracker.wait_again(plan.answered)
-        self.slots.by_layer = {}
         if is_known:
             ended_layers = plan.sets.layers.keys() - plan.sets.started
-            for number, slot in plan.former_slots.items():
-                if number not in ended_layers:
-                    self.slots.by_layer[number] = slot
+            self.slots.layers.resume(plan.former_slots, without=ended_layers)
 
-    def only_ends(self, plan: Plan) -> Plan:
-        """Return a plan that starts and prolongs nothing; contents to be started wait again."""
+    def drop_starts(self, plan: Plan) -> Plan:
+        """Let contents that a plan starts wait again; return a plan that only ends contents."""
+        started = plan.sets.started
+        if plan.kind is PlanKind.CHANGE and not started:
+            return plan
         if plan.kind is PlanKind.PROLONGATION:
             return replace(plan, sets=Sets())
-        started = plan.sets.started
-        if not started:
-            return plan
         self.not_played(plan, is_known=True)
-        endings = {
+        ends = {
             number: layer for number, layer in plan.sets.layers.items() if number not in started
         }
-        return replace(plan, sets=Sets(endings), kind=PlanKind.ENDS)
+        return replace(plan, sets=Sets(ends), kind=PlanKind.ENDS)
 
     def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
         """Note how the amplifiers play sets, which were committed before now [s].
 
         Pulses start when the last amplifier starts.
         """
-        for pulse in self._pulses_in(sets.started):
-            if pulse.started_at is not None:
-                continue
-            if played.starts_at > pulse.end:
-                self._count_too_late(1)
-            pulse.started_at = played.starts_at
-            self._intent_due = min(self._intent_due, pulse.end)
+        for number in sets.started:
+            for pulse in self.slots.by_layer[number].content.pulses:
+                if pulse.started_at is not None:
+                    continue
+                if played.starts_at > pulse.end:
+                    self._count_too_late(1)
+                pulse.started_at = played.starts_at
+                self._intent_due = min(self._intent_due, pulse.end)
         self.slots.confirm(sets, played, now)
 
-    def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
+    def replace_refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
         """Return a plan in place of one that amplifiers refused although the ledgers admit it.
 
         A refused prolongation sends nothing, and its contents end. Any other refused plan becomes
@@ -364,7 +360,7 @@ class Planner:
         unknown.
         """
         if plan.kind is PlanKind.PROLONGATION:
-            self.slots.not_renewed(plan.sets, refusal)
+            self.slots.put_off(plan.sets, refusal)
             return replace(plan, sets=Sets())
         is_by_limit = refusal.until is None or refusal.until > now
         if is_by_limit:  # otherwise the wire is too slow or busy, and a pulse is too late
@@ -372,29 +368,30 @@ class Planner:
         retry_at = now + RETRY if refusal.until is None else refusal.until
         self._retry_at = max(retry_at, now + HEARTBEAT)
         self._changes.refused = plan.answered
-        silence = self.slots.silence(FADE_RAMP, now)
+        silence = self.slots.silence(FADE_RAMP)
+        self.slots.adopt(silence, now)
         sets = replace(silence, reason=str(refusal))
         return replace(plan, sets=sets, kind=PlanKind.CHANGE)
 
-    def prepare(self) -> None:
-        """Compute in advance everything the first touch would wait for; seconds for a large rig.
+    def precompute(self, clock_errors: Mapping[str, float]) -> None:
+        """Compute everything that the first touch would wait for; seconds for a large rig.
 
-        The table without clock errors, from which statuses compute foreign levels, shares these
+        Runs in a thread, before the first plan. clock_errors: of the amplifiers by name, rms [s].
+        The table without clock errors, from which statuses compute foreign levels, shares the
         results. Raises InputError for a table without a pattern for these amplifiers.
         """
         drive_mode = self.capabilities.drive_mode
         prepare_answers(self._selector.chooser.table, drive_mode)
-        self._count_clocks()
+        self._count_clocks(clock_errors)
         table = self._selector.chooser.table
-        timing = self.slots.timing
-        timing.prepare(table.frequencies.tolist())
+        self._timing.prepare(table.frequencies.tolist())
         centre = (table.plate.length / 2, table.plate.width / 2)
         placement = Placement((centre,), ((0.0, 0.0),))
         band = self.capabilities.limits.frequencies
         pattern = query(table, placement, MIN_LEVEL_DB_SL, drive_mode=drive_mode, band_hz=band)
         (layer,) = pattern.layers
         support = self.capabilities.envelope_support
-        timing.with_envelopes(
+        self._timing.with_envelopes(
             layer, placement, onset=support.onset_knots > 0, ending=support.ending_knots > 0
         )
 
@@ -404,13 +401,12 @@ class Planner:
             self.capabilities = replace(self.capabilities, limits=limits)
             self._use(self._selector.chooser)
 
-    def _count_clocks(self) -> None:
-        """Update the table to the present clock errors; contents continue until all fingers rest.
+    def _count_clocks(self, errors: Mapping[str, float]) -> None:
+        """Update the table to clock errors, rms [s]; contents continue until all fingers rest.
 
         If a clock is no longer held, contents are chosen again immediately.
         """
         chooser = self._selector.chooser
-        errors = self.clocks.known
         is_clock_lost = self.clocks.is_one_lost(errors)
         table = self.clocks.counted_by(chooser.table, errors)
         if table is not chooser.table:
@@ -418,14 +414,14 @@ class Planner:
 
     def _chooser_of(self, table: LocalizationTable) -> Chooser:
         """Make a chooser with a table, whose envelopes follow the timing in use."""
-        shape = partial(self.capabilities.envelope_support.shape, self.slots.timing)
+        shape = partial(self.capabilities.envelope_support.shape, self._timing)
         return Chooser(table, shape)
 
     def _use(self, chooser: Chooser, *, immediately: bool = False) -> None:
         """Use another chooser: immediately, if nothing plays or so requested, or once all rest."""
         selector = self._selector
         selector.chooser = chooser
-        is_idle = not self.slots.may_play and selector.pending is None
+        is_idle = not self.slots.layers.may_play and selector.pending is None
         if immediately or is_idle:
             selector.choose_again()
         self.look_again()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from controller.play.intent import FingerSensation, Selection, not_served
 from controller.play.planner import Plan
 from controller.play.routing import Drive
-from controller.play.slots import Slot
+from controller.play.slot import Slot
 from controller.sources.touch import Change, Contact, ContactKey
 from model.answer.answer import Layer
 
@@ -80,25 +80,23 @@ def play_report(
             reason=reason,
         )
     selection = plan.selection
-    continuing = dict[int, Slot]()
-    started = dict[int, Slot]()
-    for number, slot in playing.items():
-        if slot.content not in selection.contents:
-            continue
-        if number in plan.sets.started:
-            started[number] = replace(slot)
-        else:
-            continuing[number] = replace(slot)
-    quiet_levels = dict[ContactKey, Sequence[float]]()
-    for contact in selection.quiet:
-        quiet_levels[contact.key] = selection.foreign_levels.get(contact.key, ())
+    # The slots that the plan started come last.
+    numbers = sorted(playing, key=lambda number: number in plan.sets.started)
+    contents = {
+        number: replace(playing[number])
+        for number in numbers
+        if playing[number].content in selection.contents
+    }
+    quiet_levels = {
+        contact.key: selection.foreign_levels.get(contact.key, ()) for contact in selection.quiet
+    }
     return PlayReport(
         plan.contacts,
         selection.finger_sensations,
         latency=latency,
         time=now if sent_at is None else sent_at,
         is_touch=plan.is_touch,
-        contents={**continuing, **started},
+        contents=contents,
         quiet=selection.quiet,
         quiet_levels=quiet_levels,
         settled_after=plan.sets.settled_after,

@@ -34,7 +34,7 @@ from controller.play.intent import (
 )
 from controller.play.joint_answers import STRETCH
 from controller.play.routing import PlaybackCapabilities
-from controller.play.slots import CROSSFADE, FALL_AFTER
+from controller.play.slot import CROSSFADE, FALL_AFTER
 from controller.sources.touch import Contact, ContactKey
 from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
@@ -122,12 +122,10 @@ def _targets_of(targets: Targets) -> frozenset[Target]:
 
 def _at_any_level(targets: Targets) -> set[Target]:
     """Return targets without the values that may differ in a late choice."""
-    steady_targets = set[Target]()
-    for _, target in targets:
-        steady_targets.add(
-            replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
-        )
-    return steady_targets
+    return {
+        replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
+        for _, target in targets
+    }
 
 
 _Future: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
@@ -168,8 +166,8 @@ class Selector:
     it has ended.
 
     chooser: makes the next choice, while the thread finishes with the former chooser; arrived:
-    called when the thread is done; may_lead: whether present contents can be cross-faded to these
-    at a time [s].
+    called when the thread is done; can_crossfade: whether present contents can be cross-faded to
+    these at a time [s].
     """
 
     def __init__(
@@ -177,11 +175,11 @@ class Selector:
         chooser: Chooser,
         *,
         arrived: Callable[[], None] = lambda: None,
-        may_lead: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
+        can_crossfade: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
     ) -> None:
         self.chooser = chooser
         self._arrived = arrived
-        self._may_lead = may_lead
+        self._can_crossfade = can_crossfade
         self._threads = DaemonThreads()
         self.pending: PendingChoice | None = None
         """The choice in the thread; there is one at a time."""
@@ -213,14 +211,9 @@ class Selector:
         """
         targets = _targets_on_plate(contacts, intent)
         served, skipped = _within_layers(targets, capabilities)
-        lasting = list[FingerTarget]()
-        short = list[FingerTarget]()
-        for finger in served:
-            if finger.target.is_short:
-                short.append(finger)
-            else:
-                lasting.append(finger)
-        intended = Question(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        short = tuple([finger for finger in served if finger.target.is_short])
+        lasting = tuple([finger for finger in served if not finger.target.is_short])
+        intended = Question(tuple(contacts), lasting, short, intent.protected)
         self._follow_fingers(intended)
         self._follow_situation(intended, capabilities, now)
         has_arrived = self._take_arrived(intended, now)
@@ -446,7 +439,7 @@ class Selector:
     def _lead(self, now: float) -> None:
         """Take the next step to a better answer at a time [s], if the amplifiers can."""
         step, *self._steps = self._steps
-        if not self._may_lead(step.contents, now):
+        if not self._can_crossfade(step.contents, now):
             self._steps = ()
             return
         if step.contents != self._lasting.contents:
@@ -583,10 +576,10 @@ def _joined(
         restated = part.beside([other for other in chosen if other is not part], table)
         contents += restated.contents
         unserved += restated.unserved
-    former_targets = list[FingerTarget]()
-    for contact, target in targets:
-        former_contact = former_contacts.get(contact.key, contact)
-        former_targets.append(FingerTarget(former_contact, target))
+    former_targets = [
+        FingerTarget(former_contacts.get(contact.key, contact), target)
+        for contact, target in targets
+    ]
     target_keys = {contact.key for contact, _ in targets}
     quiet = list[Contact]()
     foreign_levels = dict[ContactKey, tuple[float, ...]]()
@@ -608,13 +601,8 @@ def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
     """Return a selection with the contents of some fingers alone, by key; the others are quiet."""
     if selection.target_keys <= keys:
         return selection
-    targets = list[FingerTarget]()
-    quiet = [*selection.quiet]
-    for finger in selection.targets:
-        if finger.contact.key in keys:
-            targets.append(finger)
-        else:
-            quiet.append(finger.contact)
+    targets = [finger for finger in selection.targets if finger.contact.key in keys]
+    others = [finger.contact for finger in selection.targets if finger.contact.key not in keys]
     contents = [
         content for content in selection.contents if not keys.isdisjoint(content.contact_keys)
     ]
@@ -622,7 +610,7 @@ def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
     return replace(
         selection,
         targets=tuple(targets),
-        quiet=tuple(quiet),
+        quiet=(*selection.quiet, *others),
         contents=tuple(contents),
         unserved=tuple(unserved),
     )

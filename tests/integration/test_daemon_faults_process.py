@@ -153,7 +153,7 @@ async def test_daemon_ends_while_a_large_rig_is_prepared(tmp_path: Path) -> None
     """Its amplifiers are open by then; clients are served meanwhile."""
     hangs = (
         "import runpy, threading\nfrom controller.play.planner import Planner\n"
-        "Planner.prepare = lambda planner: threading.Event().wait()\n"
+        "Planner.precompute = lambda planner, clock_errors: threading.Event().wait()\n"
         f"runpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
     )
     async with far_end(tmp_path) as far:

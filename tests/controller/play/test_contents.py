@@ -34,7 +34,8 @@ from controller.play.intent import (
 )
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Selector
-from controller.play.slots import Slot, Slots
+from controller.play.slot import Slot
+from controller.play.slots import Slots
 from controller.sources.touch import Contact, ContactKey
 from kit.chain import FINGER, set_running
 from kit.clock import in_virtual_time
@@ -110,11 +111,9 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     clicked = (FingerTarget(CONTACTS[0], click),)
     clicking = Content(ContentKey(CONTACTS[0].key, 0), clicked, Placement((LEFT,)), pattern)
     playing = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
-    playing.by_layer = {
-        number: Slot(one, pattern, drive={}) for number, one in ((1, clicking), (0, lasting))
-    }
-    playing.may_play = frozenset({0})
-    assert playing.numbered([lasting, clicking]) == {0: lasting, 1: clicking}
+    slots = {number: Slot(one, pattern) for number, one in ((1, clicking), (0, lasting))}
+    playing.layers.take(slots, {0})
+    assert playing.layers.allocate([lasting, clicking]) == {0: lasting, 1: clicking}
     assert not playing.plan([lasting, clicking], 0.0).started
 
 

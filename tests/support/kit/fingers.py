@@ -40,9 +40,10 @@ from controller.play.intent import (
     Target,
 )
 from controller.play.joint_answers import answered, selection_of
+from controller.play.layer_sets import Sets
 from controller.play.reports import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.slots import Sets, Slots
+from controller.play.slots import Slots
 from controller.sources.touch import Contact, Touch, TouchFrame
 from controller.sources.tuio_capture import RecordedDatagram
 from drivers.errors import CommandRefused, LinkError
@@ -353,13 +354,13 @@ class Hands(Acted, Fingers):
 
     def renews_not(self, layer: int) -> None:
         """Let a layer not be renewed any more."""
-        renewal = Slots.renewal
+        renewals = Slots.renewals
 
         def others(slots: Slots, now: float) -> Sets:
-            due = renewal(slots, now).layers
+            due = renewals(slots, now).layers
             return Sets({number: each for number, each in due.items() if number != layer})
 
-        self.patch.setattr(Slots, "renewal", others)
+        self.patch.setattr(Slots, "renewals", others)
 
     def falls_silent_within(self, seconds: float, *layers: int) -> None:
         """Require that layers are silent so long after the mark, by what the amplifier plays."""

@@ -25,7 +25,7 @@ from model.quantities import counted
 from registry.limits import MAX_CONTENTS
 
 if TYPE_CHECKING:
-    from era_haptics.lab.design.design_run import UnfinishedDesign
+    from era_haptics.lab.design.design_files import UnfinishedDesign
 
 design_app = typer.Typer()
 
@@ -103,7 +103,7 @@ def design(
 
     Ctrl-C prints the layouts found so far and writes them to a file for --layouts.
     """
-    from era_haptics.lab.design.design_run import UnfinishedDesign, design_summary, write_design
+    from era_haptics.lab.design.design_files import UnfinishedDesign, design_summary, write_design
     from era_haptics.lab.design.design_run import design as find
     from model.config.document import read_document
     from model.rig.rig_file import rig_of

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from era_haptics.lab.design import problem as problem_module
-from era_haptics.lab.design.design_run import Design, Runner, assess, layout_keys, rank_layouts
+from era_haptics.lab.design.design_run import assess, rank_layouts
+from era_haptics.lab.design.layout_keys import layout_keys
 from era_haptics.lab.design.problem import (
     Area,
     ContactRule,
@@ -27,6 +28,8 @@ from era_haptics.lab.design.problem import (
     layouts_of,
     shortfall,
 )
+from era_haptics.lab.design.results import Design
+from era_haptics.lab.design.runner import Runner
 from era_haptics.lab.design.score import LayoutSearch
 from kit.plates import exciter_rig_text, make_paper_rig
 from model.arrays import ComplexArray, FloatArray

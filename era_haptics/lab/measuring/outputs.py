@@ -18,7 +18,7 @@ import numpy as np
 import typer
 from scipy.optimize import linear_sum_assignment
 
-from era_haptics.lab.measuring.measure import check_levels
+from era_haptics.lab.measuring.recording_checks import check_levels
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     Multisine,

@@ -14,11 +14,8 @@ import pytest
 from drivers.errors import LinkError
 from era_haptics.command import run_era
 from era_haptics.lab.measuring import simulated_measurement
-from era_haptics.lab.measuring.measure import (
-    MeasuredResponses,
-    check_wiring,
-    measure,
-)
+from era_haptics.lab.measuring.measure import MeasuredResponses, measure
+from era_haptics.lab.measuring.recording_checks import check_wiring
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     Multisine,

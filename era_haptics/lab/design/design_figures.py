@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from era_haptics.lab.design.results import Design
@@ -30,7 +31,7 @@ def quiet_fingers_figure(design: Design) -> Figure:
     return figure
 
 
-def _draw_contrast(axes: Axes, design: Design, targets: FloatArray, quiet: int) -> object:
+def _draw_contrast(axes: Axes, design: Design, targets: FloatArray, quiet: int) -> PathCollection:
     """Draw the target fingers of sets with a number of quiet fingers, coloured by contrast.
 
     targets: (sets, contents, 2) [m]. Returns the image for the colour bar.

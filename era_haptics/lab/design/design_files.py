@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from era_haptics.lab.design.design_figures import quiet_fingers_figure, count_figure
+from era_haptics.lab.design.design_figures import count_figure, quiet_fingers_figure
 from era_haptics.lab.design.layout_keys import layout_keys
 from era_haptics.lab.design.problem import DesignProblem
 from era_haptics.lab.design.results import Design, RankedLayout

@@ -421,7 +421,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             raise Unreachable.at(self.path, error) from error
 
     async def _pause_after(self, error: Exception, tries: _Tries) -> None:
-        """Wait before the next try; raise the error of the last try if there is none."""
+        """Wait before the next try; raise the error of the last try if no time is left."""
         pause = tries.next_pause()
         if self._is_closed or pause is None:
             raise error

@@ -162,7 +162,7 @@ class ArmResult(RenewResult):
 
 
 class RequestedBy(ApiMessage):
-    """Name for the log, if another client than that of the connection makes the request."""
+    """Client to name in the log, if the connection belongs to another one."""
 
     client: Name | None = None
 
@@ -191,7 +191,7 @@ class ClearParams(RequestedBy):
 
 
 class TouchParams(ApiMessage):
-    """All fingers of one source of this client; valid for 150 ms, so repeat it."""
+    """All fingers of a touch source; valid for 150 ms, so repeat it."""
 
     source: Name
     touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES), FailFast()]
@@ -434,7 +434,10 @@ def api_method(**treatment: bool) -> Callable[[_HandlerT], _HandlerT]:
 
     def register(handler: _HandlerT) -> _HandlerT:
         kinds = get_type_hints(handler)
-        result, *_ = *get_args(kinds["return"]), kinds["return"]  # awaited or not
+        result = kinds["return"]
+        awaited = get_args(result)  # empty unless the result is awaitable
+        if awaited:
+            (result,) = awaited
         vars(handler)["method"] = Method(kinds["params"], result, **treatment)
         return handler
 

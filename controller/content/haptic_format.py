@@ -1,7 +1,7 @@
 """.haptic files of Haptics Studio and NiceVibrations, version 1.
 
 Intensity is the square root of an amplitude, and the sharpness of a continuous event the square
-root of a frequency, as in the format's own converter to AHAP (NiceVibrations,
+root of a frequency. The format's own converter to AHAP computes the same (NiceVibrations,
 core/datamodel/src/ios/v1.rs); files that the converter rejects are rejected here. Unknown keys of
 later minor versions are ignored.
 """

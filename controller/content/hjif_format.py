@@ -2,7 +2,7 @@
 
 Reads the bands Transient, VectorialWave and Curve of profile Main, for one vibration channel;
 wavelet bands are rejected. Intensity is the amplitude, as the reference encoder writes it for AHAP;
-waveforms other than sines are converted by their root mean square.
+waveforms other than sines become sines of equal RMS.
 """
 
 import math

@@ -7,7 +7,7 @@ from controller.content.pattern import MAX_CONTENT_DURATION, Pattern, Transient
 from model.errors import InputError
 
 MAX_GIVEN = 500
-"""Maximum number of points and taps together, same as in OpenXR; Android guarantees 16."""
+"""Maximum number of points and taps together. OpenXR has the same limit; Android guarantees 16."""
 
 Given: TypeAlias = Sequence[Sequence[float]]
 """`[time_s, intensity, sharpness]` of each, in order of time."""

@@ -116,7 +116,7 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
         return values
 
     try:
-        # Integers become floats, so that huge ones are rejected by their size, like 1e999.
+        # Integers become floats: huge ones become infinite, like 1e999, and are rejected.
         data = json.loads(text, parse_int=float, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise refusal(source, _why_unparsed(text, error), line=error.lineno) from error

@@ -1,4 +1,4 @@
-"""Renditions: a pattern as stimuli of one finger at a level, independent of other fingers.
+"""Renditions: a pattern as stimuli for one finger at a level, independent of other fingers.
 
 docs/how-to/play-content.md gives the reasons.
 """

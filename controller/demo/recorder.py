@@ -263,7 +263,7 @@ class TouchRecorder:
 async def _with_pattern(row: TouchRow, touch: _Touch) -> TouchRow:
     """Complete a row with the touch's last steady pattern with the most contents.
 
-    If no pattern with as many contents is steady, the longest of these patterns is used. All
+    If none of these is steady, the longest one is used. All
     fingers of a pattern use the same pattern, so that their rows refer to the same moment. The
     latency is measured for the touch's first pattern.
     """

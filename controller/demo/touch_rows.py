@@ -44,9 +44,9 @@ class TouchRow:
     - quiet: other fingertips by id [m].
     - pattern, levels_db_sl: levels by id: for the target the mean over its tip, for other fingers
       the loudest point. The smallest difference is the contrast.
-    - Contrasts are None for a single finger; measured ones also if the pattern was too short.
-      Predicted values are for the table's plate; 90 % of plates within the tolerances reach the
-      promised levels.
+    - Contrasts are None for a single finger. Measured contrasts are also None if the pattern was
+      too short. Predicted values are for the table's plate; 90 % of plates within the tolerances
+      reach the promised levels.
     - drive: as achieved by the amplifiers, by ERA.
     - latency_ms: from touch frame to last byte on the wire; None in virtual time.
     - reason: why nothing played, if so.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # numpy is slow to import
     from model.structure.plate import Plate
 
 RIM = 0.0065
-"""Distance [m] beyond the plate's edge within which a finger counts as on the edge: its radius.
+"""Distance [m] beyond the plate's edge, a finger's radius, within which a finger touches the edge.
 
 The position that cameras and frames report for a finger on the edge depends on noise and
 calibration.

@@ -32,7 +32,7 @@ _Key: TypeAlias = tuple[str, int]
 """Profile and session id of a contact."""
 
 _KeyPair: TypeAlias = tuple[_Key, _Key]
-"""Keys of a contact's cursor and blob, equal if it is only one of these."""
+"""Keys of a contact's cursor and blob; the same key twice for a contact that has only one."""
 
 _NEAR = 0.02  # of the sensor: a cursor this close to the centre of a small blob is the same contact
 _PARTED = 4.0  # at this multiple of the distance they separate again; fast movement stays below it
@@ -46,7 +46,7 @@ _MAX_MESSAGES = 256  # per datagram: some 4 ms, and ten times the maximum number
 _MAX_NAME = 100  # characters; the rest is cut off
 _MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # OSC string, NUL-padded
-# As in the reference client, a frame number that drops by more than 100 is from a restarted sender.
+# The reference client also takes a drop by more than 100 for a restart of the sender.
 _LATE_FRAMES = 100
 # Senders such as the reference implementation are silent while fingers rest; some repeat the alive
 # message once a second.

@@ -21,7 +21,7 @@ from registry.files import LineTooLong, lines_of, open_regular
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
 _MAX_LINE = 1 << 18  # characters; a datagram has up to 64 KiB, two digits per byte
-MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; a quarter of an hour of one finger
+MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz, or 15 min of one finger
 
 
 @dataclass(frozen=True, slots=True)

@@ -189,7 +189,7 @@ export interface DisarmParams {
   lease?: string | null;
 }
 
-/** Name for the log, if another client than that of the connection makes the request. */
+/** Client to name in the log, if the connection belongs to another one. */
 export interface RequestedBy {
   client?: string | null;
 }
@@ -209,7 +209,7 @@ export interface ClearParams {
   epoch?: number | null;
 }
 
-/** All fingers of one source of this client; valid for 150 ms, so repeat it. */
+/** All fingers of a touch source; valid for 150 ms, so repeat it. */
 export interface TouchParams {
   source: string;
   touches: Array<TouchPoint>;

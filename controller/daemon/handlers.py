@@ -9,7 +9,6 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from functools import partial
-from typing import NamedTuple
 
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
@@ -39,14 +38,12 @@ from controller.api.methods import (
 )
 from controller.api.schema import AmplifierSilence, Empty, TouchPoint, headline
 from controller.api.server import Connection, Handler
-from controller.content.points import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import EventPublisher, effects_result, hello_result
 from controller.daemon.plate_view import playing_of
-from controller.effects.effect import MIN_DB_SL, Effect
-from controller.effects.file_effect import File
-from controller.effects.layout import SurfaceLayout
+from controller.daemon.requested_effect import requested_effect
+from controller.effects.effect import Effect
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
@@ -57,12 +54,9 @@ from controller.operation.operation_states import (
 )
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import LEASE_OVER, Supervisor
-from controller.play.intent import MAX_DB_SL
 from controller.sources.touch import Contact, Touch, TouchFrame
 from drivers.host.stops import StopOutcome
 from model.compiled.kernels import why_slow
-from model.errors import InputError
-from model.finger import STRONG_DB_SL
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from registry import threads
@@ -311,7 +305,7 @@ class ApiService:
     async def play(self, client: Connection, params: PlayParams) -> Empty:
         """Play an effect, or points and taps, at a finger; only while armed."""
         # At the contact nearest to the position, at most at the effect's own level.
-        requested = self._requested_effect(params)
+        requested = requested_effect(params, self._layouts.player.layout)
         effect = requested.effect
         level = params.level_db_sl
         if level is not None:
@@ -370,21 +364,6 @@ class ApiService:
         if nearest.why_load_alone:
             raise RpcError(ErrorCode.REFUSED, nearest.why_load_alone, where="x_m")
         return nearest
-
-    def _requested_effect(self, params: PlayParams) -> "_RequestedEffect":
-        """Return the effect to play; raises RpcError."""
-        has_points = bool(params.points or params.taps)
-        if (params.effect is None) != has_points:
-            raise RpcError(
-                ErrorCode.INVALID_PARAMS,
-                "play must have either an effect, or points and taps, got both or neither",
-                where="effect",
-                remedy="leave one of them out",
-            )
-        layout = self._layouts.player.layout
-        if params.effect is None:
-            return _effect_of_points(params, layout)
-        return _effect_of_layout(params.effect, layout, loop=params.loop)
 
     @api_method()
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
@@ -450,61 +429,6 @@ class ApiService:
         """Disarm if the client disconnected before it received its lease."""
         if client.has_left:
             self._supervisor.withdraw(token, "the arming client disconnected")
-
-
-class _RequestedEffect(NamedTuple):
-    """An effect that a client wants to play."""
-
-    name: str
-    effect: Effect
-    max_db_sl: float
-    """Highest level that the client can request [dB SL]."""
-
-    def check_level(self, level: float, *, is_named: bool) -> None:
-        """Raise RpcError for a level [dB SL] out of range; is_named: whether a layout names it."""
-        if not MIN_DB_SL <= level <= self.max_db_sl:
-            owner = f" of effect {self.name!a}" if is_named else ""
-            raise RpcError(
-                ErrorCode.REFUSED,
-                f"level{owner} must be from {MIN_DB_SL:g} to {self.max_db_sl:g} dB SL, got "
-                f"{level:g}",
-                where="level_db_sl",
-                remedy="choose a level in this range, or change the level in the surface layout",
-            )
-
-
-def _effect_of_points(params: PlayParams, layout: SurfaceLayout) -> _RequestedEffect:
-    """Return the effect of the points and taps of a request; raises RpcError."""
-    try:
-        pattern = pattern_of_points(params.points, params.taps)
-    except InputError as error:
-        raise RpcError(ErrorCode.INVALID_PARAMS, f"{error}", where="points") from error
-    max_db_sl = min(layout.max_db_sl, MAX_DB_SL)
-    level = min(STRONG_DB_SL, max_db_sl)
-    effect = File.of(pattern, name="points", level_db_sl=level, loop=params.loop)
-    return _RequestedEffect("points", effect, max_db_sl)
-
-
-def _effect_of_layout(name: str, layout: SurfaceLayout, *, loop: bool) -> _RequestedEffect:
-    """Return the effect of a layout with a name, repeated on request; raises RpcError."""
-    effect = layout.effects.get(name)
-    if effect is None:
-        raise RpcError(
-            ErrorCode.REFUSED,
-            f"unknown effect {name!a}",
-            where="effect",
-            remedy=f"choose one of {', '.join(sorted(layout.effects))}",
-        )
-    max_db_sl = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
-    if not loop:
-        return _RequestedEffect(name, effect, max_db_sl)
-    if not isinstance(effect, File):
-        raise RpcError(
-            ErrorCode.REFUSED,
-            f"loop must be left out for effect {name!a}, which is not a file",
-            where="loop",
-        )
-    return _RequestedEffect(name, effect.model_copy(update={"loop": True}), max_db_sl)
 
 
 def _touch_at(point: TouchPoint, plate: Plate) -> Touch:

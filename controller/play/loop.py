@@ -198,7 +198,7 @@ class Cycle:
     async def _play_silence(self, planner: Planner, ramp: float) -> float:
         """Silence all layers along a ramp [s]; return when [s] the last request was sent."""
         sent_at = await self.group.silence(ramp)
-        planner.slots.layers.confirm_silence()
+        planner.confirm_silence()
         return sent_at
 
     async def _play_layers(self, planner: Planner, sets: Sets) -> float:
@@ -242,7 +242,7 @@ class Cycle:
             raise CommandError("controller must be open; call open() first")
         self._is_newly_armed = True
         if not was_armed:
-            self.planner.slots.layers.confirm_silence()
+            self.planner.confirm_silence()
         self.planner.replace_limits(limits)
         self._schedule_expiry()  # fingers may have rested since before
         self.feed_at_once()

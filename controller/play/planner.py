@@ -325,7 +325,10 @@ class Planner:
             self.slots.layers.resume(plan.former_slots, without=ended_layers)
 
     def drop_starts(self, plan: Plan) -> Plan:
-        """Let contents that a plan starts wait again; return a plan that only ends contents."""
+        """Return a plan that only ends contents; contents that the plan starts wait again.
+
+        Prolongations are dropped, so that their contents end by themselves.
+        """
         started = plan.sets.started
         if plan.kind is PlanKind.CHANGE and not started:
             return plan
@@ -351,6 +354,10 @@ class Planner:
                 pulse.started_at = played.starts_at
                 self._intent_due = min(self._intent_due, pulse.end)
         self.slots.confirm(sets, played, now)
+
+    def confirm_silence(self) -> None:
+        """Note that all layers are silent for certain."""
+        self.slots.layers.confirm_silence()
 
     def replace_refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
         """Return a plan in place of one that amplifiers refused although the ledgers admit it.

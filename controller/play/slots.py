@@ -2,9 +2,8 @@
 
 Planning (`plan`, `silence`, `endings`, `renewals`) returns sets and changes nothing. `adopt` takes
 planned sets as the playback before they are sent, and `confirm` notes that the amplifiers have
-committed them. The ledgers are queried before a set is made: contents that they
-refuse are planned along plain ramps, then without the newest content; if no content is left,
-nothing plays.
+committed them. The ledgers are queried in planning: contents that they refuse are planned along
+plain ramps, then without the newest content; if no content is left, nothing plays.
 """
 
 import logging

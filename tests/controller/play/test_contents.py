@@ -34,7 +34,7 @@ from controller.play.intent import (
 )
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Selector
-from controller.play.slot import Slot
+from controller.play.slot import Slot, SlotPhase
 from controller.play.slots import Slots
 from controller.sources.touch import Contact, ContactKey
 from kit.chain import FINGER, set_running
@@ -115,6 +115,24 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     playing.layers.take(slots, {0})
     assert playing.layers.allocate([lasting, clicking]) == {0: lasting, 1: clicking}
     assert not playing.plan([lasting, clicking], 0.0).started
+
+
+def test_slots_change_only_when_a_plan_is_adopted() -> None:
+    """Planning a start and a silence leaves all layers as they are; silence is planned once."""
+    key = CONTACTS[0].key
+    targets = (FingerTarget(CONTACTS[0], Target(key, 14.0)),)
+    layer = Layer({"SW": Tone(100.0, 1e-6)})
+    content = Content(ContentKey(key, 0), targets, Placement((LEFT,)), layer)
+    slots = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 10.0)
+    start = slots.plan([content], 0.0)
+    assert (slots.by_layer, slots.layers.may_play) == ({}, frozenset())
+    slots.adopt(start, 0.0)
+    assert slots.by_layer[0].phase is SlotPhase.STARTING
+    silence = slots.silence(0.01)
+    assert slots.by_layer[0].content == content
+    slots.adopt(silence, 0.1)
+    assert (slots.by_layer, slots.layers.may_play) == ({}, {0})  # until it is confirmed
+    assert slots.silence(0.01).is_empty
 
 
 FREE = playable()

@@ -20,7 +20,8 @@ from functools import partial
 from typing import TypeAlias
 
 from drivers.errors import CommandRefused, Overtaken, Preempted
-from drivers.host.amplifier import COMMITTING, Amplifier
+from drivers.host.amplifier import Amplifier
+from drivers.host.amplifier_record import COMMITTING
 from drivers.host.group_states import Failure
 from drivers.host.ledger import StagedSet, is_silence
 from drivers.host.line import Line

@@ -1,8 +1,8 @@
 """Stops of one amplifier, and bounds on what it may play after them.
 
 `PendingStop` repeats a stop until a status confirms it. `PlaybackBound` keeps what confirmed stops,
-arming and clearing show about the end of playback; `Amplifier.what_may_play` combines it with the
-watchdog and the last status.
+arming and clearing show about the end of playback; `AmplifierRecord.what_may_play` combines it with
+the watchdog and the last status.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
 """The checks of an amplifier's conformance to protocol 4, in order of execution.
 
-A run takes the checks that only read first; the others arm the amplifier and drive its channels.
+Checks that only read come first; the others arm the amplifier and drive its channels.
 """
 
 from era_haptics.lab.conformance.check import ConformanceCheck

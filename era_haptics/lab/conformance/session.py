@@ -118,9 +118,9 @@ class CheckSession:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection(self, session: pytest.Session) -> bool:
-        """Collect the checks, those that only read first, and select those that match."""
+        """Collect the checks, and select those that match."""
         items: list[CheckItem] = []
-        for number, check in sorted(self._checks, key=lambda numbered: numbered[1].drives):
+        for number, check in self._checks:
             item = CheckItem.from_parent(
                 session,
                 name=check.name,

@@ -79,7 +79,7 @@ async def discarded_frames(subject: Subject) -> None:
             await subject.run([subject.ping])
 
 
-@reading("serial.md#receiving", "serial")
+@driving("serial.md#receiving", "serial")
 async def tolerated_frames(subject: Subject) -> None:
     """Frame in noise, in pieces or back to back: one reply to each.
 

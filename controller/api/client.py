@@ -21,6 +21,7 @@ import inspect
 from collections import deque
 from collections.abc import (
     AsyncIterator,
+    Awaitable,
     Callable,
     Coroutine,
     Iterator,
@@ -161,7 +162,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         """
         client = cls(find_socket(path), name=name, timeout=timeout)
         async with client._time_limit():
-            await client._restored_session(_Tries(_REPEATED_FOR))
+            await client._repeated(client._restored, _Tries(_REPEATED_FOR))
         return client
 
     async def __aexit__(self, *_: object) -> None:
@@ -341,7 +342,7 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                     self._changed.clear()
                     async with self._time_limit():
                         tries = _Tries(0.9 * self._timeout)
-                        await self._restored_session(tries, (RpcError, Unreachable))
+                        await self._repeated(self._restored, tries, (RpcError, Unreachable))
                     await self._changed.wait()
         if not self._events:
             return None
@@ -394,20 +395,18 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         Returns its result as parsed JSON, including unknown keys of a newer daemon. Requests that
         silence are sent before subscriptions are restored.
         """
+        connect = self._opened if method in SILENCING else self._restored
         tries = _Tries(_REPEATED_FOR)
+
+        async def attempt() -> Any:
+            session = await self._repeated(connect, tries)
+            return await session.call(method, params)
+
         repeated_after: tuple[type[Unreachable], ...] = ()
         if METHODS[method].is_repeated:
             repeated_after = (Unreachable if method == "stop" else ConnectionLost,)
         async with self._time_limit():
-            while True:
-                try:
-                    if method in SILENCING:
-                        session = await self._open_session(tries)
-                    else:
-                        session = await self._restored_session(tries)
-                    return await session.call(method, params)
-                except repeated_after as error:
-                    await self._pause_after(error, tries)
+            return await self._repeated(attempt, tries, repeated_after)
 
     @asynccontextmanager
     async def _time_limit(self) -> AsyncIterator[None]:
@@ -420,39 +419,29 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
                 self._session.abort()
             raise Unreachable.at(self.path, error) from error
 
-    async def _pause_after(self, error: Exception, tries: _Tries) -> None:
-        """Wait before the next try; raise the error of the last try if no time is left."""
-        pause = tries.next_pause()
-        if self._is_closed or pause is None:
-            raise error
-        await asyncio.sleep(pause)
-
-    async def _restored_session(
+    async def _repeated(
         self,
+        attempt: Callable[[], Awaitable[_T]],
         tries: _Tries,
-        repeated_after: tuple[type[Exception], ...] = (ConnectionLost,),
-    ) -> ClientSession:
-        """Return a session with all subscriptions; raises RpcError and Unreachable.
-
-        repeated_after: errors after which to try again.
-        """
+        after: tuple[type[Exception], ...] = (ConnectionLost,),
+    ) -> _T:
+        """Return the result of an attempt; repeat it after some errors, while there are tries."""
         while True:
             try:
-                async with self._restoring:
-                    session = await self._opened()
-                    if not session.is_restored:
-                        await self._restore(session)
-                    return session
-            except repeated_after as error:
-                await self._pause_after(error, tries)
+                return await attempt()
+            except after:
+                pause = tries.next_pause()
+                if self._is_closed or pause is None:
+                    raise
+                await asyncio.sleep(pause)
 
-    async def _open_session(self, tries: _Tries) -> ClientSession:
-        """Return a session, perhaps without subscriptions; raises RpcError and Unreachable."""
-        while True:
-            try:
-                return await self._opened()
-            except ConnectionLost as error:
-                await self._pause_after(error, tries)
+    async def _restored(self) -> ClientSession:
+        """Return the session with all subscriptions; raises RpcError and Unreachable."""
+        async with self._restoring:
+            session = await self._opened()
+            if not session.is_restored:
+                await self._restore(session)
+            return session
 
     async def _opened(self) -> ClientSession:
         """Return the session, a new one if it was lost; raises RpcError and Unreachable."""

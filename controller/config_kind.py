@@ -1,4 +1,4 @@
-"""`ConfigKind`: how `era config` recognises, checks and writes one kind of configuration file."""
+"""`ConfigKind`: how `era config` recognizes, checks and writes one kind of configuration file."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

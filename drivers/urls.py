@@ -1,4 +1,4 @@
-"""URLs of amplifiers: their parts, and the synchronisation error of clocks over their lines.
+"""URLs of amplifiers: their parts, and the synchronization error of clocks over their lines.
 
 A URL is SCHEME://PLACE?NAME=VALUE&...#NUMBER. Each wire (`drivers.wires`) takes the parts that it
 has. The kinds of lines have the names of the simulated ones (`sim.transport.simulated_line`).

@@ -1,7 +1,7 @@
 """Localized vibration from a notebook: `import era_haptics as era`.
 
 Rigs, solved plates, maps, localization tables, patterns for fingers, playback in time, pictures,
-amplifiers and clients of the daemon. Positions are in metres from the corner SW, x along the
+amplifiers and clients of the daemon. Positions are in meters from the corner SW, x along the
 plate's length, y along its width; other values are in SI units or have the unit in their name.
 Invalid input raises InputError, a ValueError.
 

@@ -34,7 +34,7 @@ _MAX_SUM = 1 + 1e-6
 
 _UNITS_OF_A_TONE = {
     "frequency": "hertz",
-    "amplitude": "metres, or volts of an exciter",
+    "amplitude": "meters, or volts of an exciter",
     "phase": "radians",
 }
 
@@ -72,7 +72,7 @@ def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
         return ()
     if found.ndim > 2 or found.shape[-1:] != (2,):
         raise InputError(
-            f"{what} must be x, y in metres from the corner SW, such as (0.08, 0.06), or a list of "
+            f"{what} must be x, y in meters from the corner SW, such as (0.08, 0.06), or a list of "
             f"such pairs, got {positions!r}"
         )
     return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))

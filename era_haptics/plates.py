@@ -275,7 +275,7 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
 
 
 def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
-    """Draw all layers of an answer over the plate, each in its colour, grey where they mix.
+    """Draw all layers of an answer over the plate, each in its color, gray where they mix.
 
     Each finger has its frequency, verdict, promised level and contrast next to it. Each layer is
     also drawn alone. Same picture as `era demo`. Raises InputError for an answer without layers.

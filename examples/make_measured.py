@@ -116,7 +116,7 @@ def fit_tone(times: FloatArray, samples: FloatArray, frequency: float) -> Comple
 
 
 def scanning_grid(plate: Plate, nx: int, ny: int, *, like: Accelerometer) -> list[Accelerometer]:
-    """Return equal sensors at the centres of nx by ny cells, numbered along x from the origin."""
+    """Return equal sensors at the centers of nx by ny cells, numbered along x from the origin."""
     sensors = []
     for row in range(ny):
         for column in range(nx):

@@ -6,7 +6,7 @@ For researchers. Open this file as a notebook in VS Code (or in Jupyter with jup
 with `%matplotlib inline` to see the figures, or run `python examples/researcher.py`. If the
 environment variable ERA_PICTURES names a folder, the figures are saved there.
 
-Positions are in metres from the south-west corner: x along the plate's length, y along its width.
+Positions are in meters from the south-west corner: x along the plate's length, y along its width.
 Levels are in dB SL, decibels above the detection threshold of a fingertip. A vibration of 12 dB SL
 is felt; 20 dB SL is strong.
 """

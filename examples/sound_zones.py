@@ -28,7 +28,7 @@ POINT_WEIGHTS = np.concatenate([np.full(n, weight) for n, _, weight in RINGS])
 
 # The methods: fields (frequencies, ERAs, points) of both zones -> weights (frequencies, ERAs).
 def contrast_control(bright, dark, loading=1e-3):
-    """Acoustic contrast control: maximise the power ratio of bright and dark zone.
+    """Acoustic contrast control: maximize the power ratio of bright and dark zone.
 
     The weights are the principal eigenvector (Choi and Kim, J. Acoust. Soc. Am. 111, 2002, 1695).
     """
@@ -42,7 +42,7 @@ def contrast_control(bright, dark, loading=1e-3):
 def pressure_matching(bright, dark, loading=1e-3):
     """Pressure matching: approximate 1 in the bright zone and 0 in the dark zone.
 
-    The weights are regularised least squares (Poletti, 125th AES Convention, 2008).
+    The weights are regularized least squares (Poletti, 125th AES Convention, 2008).
     """
     zones = np.concatenate([bright, dark], axis=2)
     desired = np.repeat([1.0, 0.0], [bright.shape[2], dark.shape[2]])

@@ -65,7 +65,7 @@ def best_along(scores: ArrayLike, axis: int) -> IntArray:
 def best_first(scores: ArrayLike) -> IntArray:
     """Return the order of scores (n,), highest first; nearly equal scores keep their order.
 
-    Neighbours in a run of nearly equal scores are close to each other, but not always to all
+    Neighbors in a run of nearly equal scores are close to each other, but not always to all
     others.
     """
     values = np.asarray(scores)

@@ -1,4 +1,4 @@
-"""Optimise ERA drives in each drive mode.
+"""Optimize ERA drives in each drive mode.
 
 - `switched`: one or two ERAs at full stroke, each at its own frequency.
 - `phased`: all ERAs at one frequency, with arbitrary amplitudes and phases (minimum-variance,
@@ -215,7 +215,7 @@ For 20 targets, 4 starts of 8 iterations lose 0.3 dB more in the median.
 """
 
 LIMITED_STEPS = 30
-"""Iterations towards weights that reach the level within full stroke; ten lose up to 1.4 dB where
+"""Iterations toward weights that reach the level within full stroke; ten lose up to 1.4 dB where
 drives are known to 5 %."""
 
 MAX_GROWTH, MAX_MULTIPLIER = 100.0, 1e12

@@ -458,7 +458,7 @@ def lowest_modes(
 
 
 def factorise(matrix: sparse.sparray) -> SuperLU:
-    """Factorise a matrix with symmetric pattern and a strong diagonal.
+    """Factorize a matrix with symmetric pattern and a strong diagonal.
 
     SuperLU's defaults, meant for unsymmetric matrices, take several times longer here; a pivot
     threshold above zero alone made it 80 times slower.

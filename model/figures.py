@@ -3,8 +3,8 @@
 - Maps of the plate's acceleration, with marks for ERAs and nulls.
 - Measurements compared with a calibration, and with promises.
 - Templates: full-scale drawings of a board that mark where each part is glued. Lengths are in
-  millimetres. A template of the underside is mirrored left to right, but its letters are not.
-- Contents: where each content is felt according to a table, each in its own colour.
+  millimeters. A template of the underside is mirrored left to right, but its letters are not.
+- Contents: where each content is felt according to a table, each in its own color.
 - Tables: weak cells, levels, contrast, and an answer with its fingertips.
 """
 
@@ -56,7 +56,7 @@ from model.vibration import NULL_SHARE, Excitation, G, PlateMap
 COLORS = "viridis"
 ACTIVE_COLOR = "#d55e00"
 RESTING_COLOR = "white"
-"""Colours of ERAs that are driven and of others, which differ in brightness, too."""
+"""Colors of ERAs that are driven and of others, which differ in brightness, too."""
 
 PAGE_WIDTH = 8.0
 """Width of figures with several panels [in]. A page shows it in 700 pixels: 8 pt are 10 pixels."""
@@ -79,7 +79,7 @@ def draw_eras(
 ) -> None:
     """Mark ERAs by squares: orange with a white rim if driven, white with a black rim if not.
 
-    The axes are in centimetres, the size is in points.
+    The axes are in centimeters, the size is in points.
     """
     for era in eras:
         is_active = era.name in active
@@ -103,7 +103,7 @@ _MARKS = "Squares: ERAs (orange: driven). White lines: a tenth of the map's maxi
 
 
 def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
-    """Draw maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs.
+    """Draw maps side by side on one color scale in g (1 g = 9.8 m/s²), with ERAs.
 
     White lines surround nulls: there the plate moves a tenth of the map's maximum.
     """
@@ -143,7 +143,7 @@ def _draw_nulls(axes: Axes, solved: PlateMap) -> None:
 
 
 def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title: str) -> Figure:
-    """Draw one map with its ERAs, a white contour around nulls and a colour bar in g."""
+    """Draw one map with its ERAs, a white contour around nulls and a color bar in g."""
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
 
 
@@ -173,7 +173,7 @@ def drive_title(excitation: Excitation, rig: Rig) -> str:
 
 
 def label_plate(axes: Axes) -> None:
-    """Label axes in centimetres, of equal scale."""
+    """Label axes in centimeters, of equal scale."""
     axes.set_aspect("equal")
     axes.tick_params(labelsize=SMALL_TEXT)
     axes.set_xlabel("x / cm", fontsize=SMALL_TEXT)
@@ -485,10 +485,10 @@ def _beside(
 
 
 CONTENT_COLORS = ("#ffa62b", "#4f9dff", "#35e07a", "#ff5fa2")
-"""Colours of contents, in order; the first two differ most to colour-blind readers."""
+"""Colors of contents, in order; the first two differ most to color-blind readers."""
 
 BRIGHTEST_DB_SL = 30.0
-"""Level from which a colour is at its brightest; the detection threshold is black."""
+"""Level from which a color is at its brightest; the detection threshold is black."""
 
 _GREY = 0.62
 _RADIUS = 100 * FINGERTIP_RADIUS  # cm
@@ -501,7 +501,7 @@ def contents_figure(
     """Draw a panel with all contents and one for each, as the table predicts them.
 
     Verdict, level and contrast are printed next to every finger, and frequencies in every large
-    patch without its own finger, since colours alone are not enough for every reader.
+    patch without its own finger, since colors alone are not enough for every reader.
     """
     count = len(contents)
     levels = np.array([_levels(table, layer) for layer in contents])
@@ -514,7 +514,7 @@ def contents_figure(
     main = panels["all"]
     _draw_contents(main, table, levels, CONTENT_COLORS, fingers)
     main.set_title(
-        "Colour: a finger feels its own content. Grey: contents mix.", fontsize=TITLE_TEXT
+        "Color: a finger feels its own content. Gray: contents mix.", fontsize=TITLE_TEXT
     )
     for finger in fingers:
         _label_finger(main, finger, contents)
@@ -563,7 +563,7 @@ def _draw_contents(
     colors: Sequence[str],
     fingers: Sequence[Sensation],
 ) -> None:
-    """Draw fingers, and the loudest content in its colour, which fades to grey near others."""
+    """Draw fingers, and the loudest content in its color, which fades to gray near others."""
     plate = table.plate
     loudest, contrast = _contrasts(levels)
     purity = np.clip(contrast / OWN_CONTRAST_DB, 0, 1)[:, :, None]
@@ -593,7 +593,7 @@ def _label_patches(
 ) -> None:
     """Outline the patches that feel like one content, and write frequencies into large ones.
 
-    A patch with its own finger is not labelled again.
+    A patch with its own finger is not labeled again.
     """
     _, rows, columns = levels.shape
     step_x = 100 * table.plate.length / (columns - 1)
@@ -629,13 +629,13 @@ def _label_patches(
 
 
 def _centimetres(finger: Sensation) -> tuple[float, float]:
-    """Return a finger's position in centimetres."""
+    """Return a finger's position in centimeters."""
     x, y = finger.finger.at
     return 100 * x, 100 * y
 
 
 def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
-    """Write verdict, level and contrast next to a finger, towards the middle of the plate."""
+    """Write verdict, level and contrast next to a finger, toward the middle of the plate."""
     words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
     lines = [str(words)]
     if finger.layer is not None:
@@ -662,7 +662,7 @@ def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> N
 
 
 def _color_of(finger: Sensation) -> str:
-    """Return the colour of a finger's content, white without one."""
+    """Return the color of a finger's content, white without one."""
     return "white" if finger.layer is None else CONTENT_COLORS[finger.layer % len(CONTENT_COLORS)]
 
 
@@ -846,7 +846,7 @@ _SIDE = 121  # points along a side; nulls are narrow
 
 
 def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) -> None:
-    """Draw the sensation level [dB SL] over the plate, and the ERAs; axes in centimetres."""
+    """Draw the sensation level [dB SL] over the plate, and the ERAs; axes in centimeters."""
     x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
     amplitudes = table.amplitudes(excitation, lattice(x, y))
     level = sensation_level(*amplitudes, table.threshold).reshape(_SIDE, _SIDE)
@@ -883,7 +883,7 @@ def level_label(threshold: str) -> str:
 def draw_level_scale(
     figure: Figure, axes: Iterable[Axes], threshold: str, *, shrink: float
 ) -> None:
-    """Draw the colour scale of `draw_levels` next to axes, shrunk to a share of their height.
+    """Draw the color scale of `draw_levels` next to axes, shrunk to a share of their height.
 
     threshold: name of the set that levels are relative to.
     """

@@ -1,7 +1,7 @@
 """A finger on the plate: contact area, detection thresholds, levels above them, and contrast.
 
 A fingertip is a disc, sampled at points with weights for the mean of a field. The cubature has
-rings about the centre, at Gauss-Lobatto points of the radius squared, with evenly spaced points
+rings about the center, at Gauss-Lobatto points of the radius squared, with evenly spaced points
 (product rules: Stroud, Approximate Calculation of Multiple Integrals, 1971, section 2.6). The
 outermost ring is the rim, so the largest value over the points is close to that over the disc.
 Where an edge of the plate cuts the disc, the mean is over the part that remains.
@@ -44,7 +44,7 @@ class DiscRule:
     def cut(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return points (k, p, 2) and weights (..., k, p) for the disc's parts in k rectangles.
 
-        low, high (k, 2): corners of the rectangles, in radii from the disc's centre, which they
+        low, high (k, 2): corners of the rectangles, in radii from the disc's center, which they
         contain. Points outside move to the nearest place inside and get weight 0; the weights of
         the others make the mean of linear functions exact.
         """
@@ -86,7 +86,7 @@ def _rings(*rings: tuple[float, int, float]) -> DiscRule:
 
 
 FIVE_POINTS = _rings((0.0, 1, 1 / 2), (1.0, 4, 1 / 2))
-"""The centre and four points of the rim, exact to degree 3: for searches."""
+"""The center and four points of the rim, exact to degree 3: for searches."""
 
 FINE_POINTS = _rings((0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6))
 """Twenty-one points (twelve on the rim), exact to degree 7: for figures."""
@@ -99,7 +99,7 @@ FIVE_AND_FINE = DiscRule(
 
 
 def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the centroids (k, 2) of the unit disc's parts in rectangles that contain its centre.
+    """Return the centroids (k, 2) of the unit disc's parts in rectangles that contain its center.
 
     Integrals over y are exact; over x by Gauss-Legendre points of the angle asin(x), piecewise
     between the corners where rim and rectangle meet.
@@ -131,7 +131,7 @@ move before its pattern changes (docs/concepts/people.md).
 def fingertips_on(
     centres: FloatArray, *, length: float, width: float, rule: DiscRule = FINE_POINTS
 ) -> tuple[FloatArray, FloatArray]:
-    """Return points (k, p, 2) [m] under fingertips centred at (k, 2) [m], and weights (..., k, p).
+    """Return points (k, p, 2) [m] under fingertips centered at (k, 2) [m], and weights (..., k, p).
 
     The weighted sum over a fingertip's points is the mean over its disc, or over the part of it
     that is on the plate. All points are on the plate and under the fingertip.
@@ -143,7 +143,7 @@ def fingertips_on(
 
 
 def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
-    """Return points (p, 2) [m] under a fingertip centred at x, y [m] on the plate."""
+    """Return points (p, 2) [m] under a fingertip centered at x, y [m] on the plate."""
     return np.asarray(_one(x, y, plate)[0][0])
 
 
@@ -179,7 +179,7 @@ class Grid:
         return self.nx * self.ny
 
     def centres(self, plate: Plate) -> FloatArray:
-        """Return the centres (cell_count, 2) of the cells [m]."""
+        """Return the centers (cell_count, 2) of the cells [m]."""
         x = (np.arange(self.nx) + 0.5) * plate.length / self.nx
         return lattice(x, (np.arange(self.ny) + 0.5) * plate.width / self.ny)
 

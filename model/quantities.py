@@ -11,7 +11,7 @@ def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
     """Format a value of an SI unit, or of none, in the unit usual for plates: `17 kN/m`."""
     factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
     shown = f"{value * factor:.{digits}g}"
-    if "e+" in shown:  # a plate of a metre is 1000 mm
+    if "e+" in shown:  # a plate of a meter is 1000 mm
         shown = f"{value * factor:.0f}"
     return f"{shown} {shown_unit}".strip()
 

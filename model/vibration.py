@@ -1,10 +1,10 @@
-"""Steady vibration of a rig's plate: excitations, maps, natural modes and discretisation errors.
+"""Steady vibration of a rig's plate: excitations, maps, natural modes and discretization errors.
 
 An excitation is a tone for each active ERA. ERAs at the same frequency add as complex numbers;
 between different frequencies magnitudes add (paper Eq. 28). Magnitudes added within a frequency
 would wipe out the nodal lines.
 
-Discretisation errors are changes against a finer mesh (`study_convergence`). Where there is none,
+Discretization errors are changes against a finer mesh (`study_convergence`). Where there is none,
 they are estimated (`estimate_error`). For polynomials over the plate the estimate is the sum of two
 changes of the response: by two further degrees, and by a compliance under forces that polynomials
 do not resolve which is higher by 20 % and, under points, by a decade of the logarithm
@@ -313,7 +313,7 @@ _RASTER = (49, 37)
 
 @dataclass(frozen=True)
 class MeshError:
-    """Discretisation error of a mesh, relative to the reference."""
+    """Discretization error of a mesh, relative to the reference."""
 
     mesh: PlateMesh
     frequency: FloatArray

@@ -91,7 +91,7 @@ def sim(
     ] = None,
     finger: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="Place a finger at this position in metres (repeatable)."),
+        typer.Option(metavar="X,Y", help="Place a finger at this position in meters (repeatable)."),
     ] = None,
     exact: ExactOption = False,
     seed: SeedOption = None,

@@ -10,7 +10,7 @@ of a request are ignored.
                                                 "amplifiers": {NAME: {"state", "fault", "token",
                                                 "high_voltage", "levels"}}}
 
-    fingers, positions [x, y] in metres
+    fingers, positions [x, y] in meters
     {"op": "fingers", "fingers": {ID: [x, y]}, "observers": [ID, ...], "loads": {ID: factor}}
                                                replace all fingers; observers load nothing, other
                                                fingers load as the rig's fingertip times "load":

@@ -8,7 +8,7 @@ Fault files list fault windows:
       - {fault: unplug, at: 15, lasts: 0.5, amplifier: main}
 
 Faults of frames (drop, delay, duplicate, corrupt, truncate) apply to whole frames sent by the
-amplifier, and to pieces of the stream received from the host. Not modelled: noise between frames,
+amplifier, and to pieces of the stream received from the host. Not modeled: noise between frames,
 collisions.
 """
 

@@ -3,7 +3,7 @@
 As in `era sim`, the plate is drawn at random from the rig's tolerances. All named amplifiers of a
 rig drive the same plate, as do all amplifiers with the same control socket; the only amplifier of a
 rig, if not named, has a separate plate. Requests and replies are the bytes of a serial line, with
-the delays of a USB adapter where a rig has several amplifiers. Not modelled: transmission time.
+the delays of a USB adapter where a rig has several amplifiers. Not modeled: transmission time.
 """
 
 import asyncio

@@ -89,6 +89,19 @@ _logger.warning("as of %s", "what", "is")
 }
 
 
+def test_british_spellings_are_found_except_in_keys_and_code(tmp_path: Path) -> None:
+    """In prose, help and errors of any budget; not in backticks, code and docstrings."""
+    (tmp_path / "README.md").write_text("Analyses of `centre` are modelled in grey.\n", "utf-8")
+    (tmp_path / "model").mkdir()
+    module = '"""Its centre."""\nraise InputError(f"the colour of {centre} is wrong")\n'
+    (tmp_path / "model" / "module.py").write_text(module, "utf-8")
+    prose = english.read(tmp_path, allowed=[])
+    settings: dict[str, Any] = {"budgets": {"default": 2.0, "docs": 6.0}, "exceptions": {}}
+    reported = [*english.over_budget(prose, settings)]
+    assert len(reported) == 3
+    assert reported[-1].startswith("model/module.py:2: British spelling")
+
+
 def test_foreign_sentences_are_found_at_their_lines(tmp_path: Path) -> None:
     """In pages, YAML comments, docstrings, comments, help, errors and the log, but not in code."""
     for name, text in FOREIGN.items():

@@ -247,7 +247,7 @@ def request_line(id: Id, method: str, params: bytes) -> bytes:
 
 
 def event_line(topic: str, *, time: float, lost: int, data: bytes) -> bytes:
-    """An `event` notification; data: as JSON, serialised once for all subscribers; time [s]."""
+    """An `event` notification; data: as JSON, serialized once for all subscribers; time [s]."""
     head = f'{{"jsonrpc":"2.0","method":"event","params":{{"topic":"{topic}","time_s":{time:.6f}'
     return f'{head},"lost":{lost},"data":'.encode() + data + b"}}\n"
 

@@ -153,7 +153,7 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
     """Make the touch points of a frame from positions x, y [m]; raises InputError."""
     if not isinstance(positions, Iterable):
         raise InputError(
-            f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
+            f"touch: positions must be a list of x, y in meters, got {shown(positions)}"
         )
     points = []
     for number, position in enumerate(positions, start=1):
@@ -171,7 +171,7 @@ def as_position(position: object) -> tuple[float, float]:
             return x, y
         got = f"({x:g}, {y:g})"
     raise InputError(
-        "a finger's position must be x, y in metres from the plate's south-west corner, such as "
+        "a finger's position must be x, y in meters from the plate's south-west corner, such as "
         f"(0.10, 0.05), got {got}"
     )
 

@@ -410,7 +410,7 @@ class Method(NamedTuple):
     params: type[ApiMessage]
     result: type[ApiMessage]
     is_limited: bool = True
-    """Whether requests count towards a client's rate limit."""
+    """Whether requests count toward a client's rate limit."""
     silences: bool = False
     """Whether the method silences the plate."""
     in_reserve: bool = False

@@ -332,7 +332,7 @@ class AmplifierStatus(ApiMessage):
     clock_skew_us: float | None = Field(
         None,
         description="RMS error of its clock relative to the others, estimated by the host; null "
-        "for a single or unsynchronised amplifier",
+        "for a single or unsynchronized amplifier",
     )
     degraded: bool = Field(
         False,

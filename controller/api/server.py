@@ -10,7 +10,7 @@ The number of clients is bounded. Additional clients get reserve connections, wh
 methods that silence, so that another client can always connect and `stop`. Slow methods, such as
 arming, run as tasks. `Hub` (`controller/api/hub.py`) sends notifications to the connections.
 
-A request that silences is carried out before its other parts are checked, and counts towards no
+A request that silences is carried out before its other parts are checked, and counts toward no
 limit (`controller/api/silencing.py`). Its errors are reported afterwards.
 """
 
@@ -278,7 +278,7 @@ class _Call:
 
     @property
     def is_limited(self) -> bool:
-        """Whether it counts towards the request rate."""
+        """Whether it counts toward the request rate."""
         if self.silences:
             return False
         return self.error is not None or METHODS[self.method].is_limited

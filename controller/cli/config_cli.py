@@ -106,7 +106,7 @@ def kind_called(name: str) -> "ConfigKind":
 
 
 def kind_of(document: "Document") -> "ConfigKind":
-    """The kind of a document: a rig unless another kind recognises it."""
+    """The kind of a document: a rig unless another kind recognizes it."""
     kinds = config_kinds()
     for kind in kinds.values():
         if kind.recognises(document):

@@ -182,7 +182,7 @@ def strength(
 def touch(
     at: Annotated[
         list[str],
-        typer.Argument(metavar="X,Y[:X,Y] ...", help="Position or path of each finger, in metres."),
+        typer.Argument(metavar="X,Y[:X,Y] ...", help="Position or path of each finger, in meters."),
     ],
     duration: Annotated[
         float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration in s.")

@@ -91,7 +91,7 @@ def _loss(status: StatusResult, lost_for_s: float) -> str:
         silence = amplifier.silence
         if silence and silence.silence == "may_play" and silence.may_play_for_s is None:
             watchdog = "it has no known watchdog: switch it off"
-    return f"ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
+    return f"ASSUME ENERGIZED: a lost amplifier may still be playing; {watchdog}"
 
 
 def _layout(status: StatusResult) -> str:

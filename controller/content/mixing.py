@@ -1,6 +1,6 @@
 """Mixing: simultaneous continuous vibrations of a file, as one intensity and one sharpness curve.
 
-A curve between two neighbouring knots is an array (2, n): its values just inside both ends of each
+A curve between two neighboring knots is an array (2, n): its values just inside both ends of each
 interval, so that it can have a step at every knot.
 """
 
@@ -128,7 +128,7 @@ def _curve(knots: FloatArray, values: FloatArray) -> Curve:
 
 
 def thinned_curve(times: FloatArray, values: FloatArray) -> Curve:
-    """Return a curve without points that repeat another or are on the line between neighbours."""
+    """Return a curve without points that repeat another or are on the line between neighbors."""
     has_new_time = np.diff(times) > 0
     has_new_value = abs(np.diff(values)) > _SAME
     is_new = np.ones(len(times), bool)
@@ -143,7 +143,7 @@ def thinned_curve(times: FloatArray, values: FloatArray) -> Curve:
 
 
 def _is_corner(times: FloatArray, values: FloatArray) -> FloatArray:
-    """Whether each inner point (n - 2,) is at a step, or off the line between its neighbours."""
+    """Whether each inner point (n - 2,) is at a step, or off the line between its neighbors."""
     gaps = np.diff(times)
     gap_ahead = gaps[:-1]
     gap_behind = gaps[1:]

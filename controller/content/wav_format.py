@@ -82,7 +82,7 @@ class _BandCourse(NamedTuple):
 
     amplitude: FloatArray
     hertz: FloatArray
-    """Centre frequency."""
+    """Center frequency."""
 
 
 def course_of(signal: FloatArray, rate: int) -> SignalCourse:

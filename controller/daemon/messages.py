@@ -2,7 +2,7 @@
 
 `EventPublisher` keeps the latest reports and sends every change to the subscribers of its topic.
 `hello_result` and `effects_result` describe the features available to a client.
-`LatencyStatistics` summarises the latencies of touches.
+`LatencyStatistics` summarizes the latencies of touches.
 """
 
 import asyncio

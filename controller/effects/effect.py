@@ -65,7 +65,7 @@ class Region:
 
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
-"""Level name: as strong as the neighbours allow."""
+"""Level name: as strong as the neighbors allow."""
 
 MIN_DB_SL = -20.0
 """Lowest level of an effect [dB SL]."""
@@ -95,7 +95,7 @@ class EffectStimulus:
     """Stimulus of an effect at one finger, from now on."""
 
     level_db_sl: float | None
-    """None for as strong as the neighbours allow."""
+    """None for as strong as the neighbors allow."""
     until: float | None = None
     """Time [s] when the stimulus can change without the finger moving; None for never."""
     pulse: Pulse | None = None
@@ -234,7 +234,7 @@ class Effect(TunedSection, ABC):
 
     @abstractmethod
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Start a run at a finger at a time [s]; level None: as strong as the neighbours allow."""
+        """Start a run at a finger at a time [s]; level None: as strong as the neighbors allow."""
 
     def start_in(
         self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
@@ -274,7 +274,7 @@ class Effect(TunedSection, ABC):
 
     @property
     def level_db_sl(self) -> float | None:
-        """Its level; None for as strong as the neighbours allow."""
+        """Its level; None for as strong as the neighbors allow."""
         return None if isinstance(self.level, str) else self.level
 
     def max_db_sl(self, level_db_sl: float | None) -> float:

@@ -128,7 +128,7 @@ class _FileRun(EffectRun):
     """A rendition played from a time [s]: its continuous part, and its clicks in order."""
 
     def __init__(self, renditions: _Renditions, now: float, *, loop: bool, is_limit: bool) -> None:
-        """is_limit: whether to play as strongly as the neighbours allow."""
+        """is_limit: whether to play as strongly as the neighbors allow."""
         self._is_limit = is_limit
         self._duration = renditions.alone.duration
         duration = math.inf if loop else self._duration

@@ -40,7 +40,7 @@ RAMP_STEP_DB = 2.0
 _HYSTERESIS = 0.0005  # m; a finger has passed a detent once it is this far beyond it
 _ANGLE_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle if that is more
 _DEGREES_15 = 0.26179938779914946  # rad; as converted from a file
-_CENTRE_RADIUS = 0.006  # m; closer to the centre, the angle of a finger is noise
+_CENTRE_RADIUS = 0.006  # m; closer to the center, the angle of a finger is noise
 
 _SPEED_WINDOW = 0.060  # s; averaging time of the speed: panels report 60 to 200 times a second
 _REST_TIMEOUT = 0.080  # s; after this time without movement a finger is at rest
@@ -165,9 +165,9 @@ class Detents(Effect):
 
 
 class Dial(Effect):
-    """A click at each detent that the finger passes in angle about the centre of its region.
+    """A click at each detent that the finger passes in angle about the center of its region.
 
-    The finger comes down halfway between two detents. Near the centre nothing is felt.
+    The finger comes down halfway between two detents. Near the center nothing is felt.
     """
 
     kind: ClassVar[str] = "dial"
@@ -193,7 +193,7 @@ class Dial(Effect):
 
 
 class _DialRun(EffectRun):
-    """Clicks by the angle of one finger around a centre; none without a centre."""
+    """Clicks by the angle of one finger around a center; none without a center."""
 
     def __init__(
         self, dial: Dial, centre: tuple[float, float] | None, level_db_sl: float | None
@@ -214,7 +214,7 @@ class _DialRun(EffectRun):
         y = contact.y - centre_y
         radius = math.hypot(x, y)
         if radius < _CENTRE_RADIUS:
-            self._last_direction = None  # the finger can leave the centre at any angle
+            self._last_direction = None  # the finger can leave the center at any angle
             return NoStimulus() if self._notches is None else self._notches.resting(now)
         direction = math.atan2(y, x)
         if self._last_direction is not None:

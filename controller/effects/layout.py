@@ -92,7 +92,7 @@ class SurfaceLayout:
 
     @property
     def max_db_sl(self) -> float:
-        """Highest level of all effects; infinite for a level that the neighbours limit."""
+        """Highest level of all effects; infinite for a level that the neighbors limit."""
         highest = -math.inf
         for effect in self.effects.values():
             highest = max(highest, effect.max_db_sl(effect.level_db_sl))
@@ -104,7 +104,7 @@ class SurfaceLayout:
     def level_of(self, name: str, region: Region | None) -> float | None:
         """Return the level [dB SL] of an effect, by name, in a region or outside all.
 
-        None for as strong as the neighbours allow.
+        None for as strong as the neighbors allow.
         """
         if region is not None and region.has_level:
             return region.level_db_sl

@@ -7,7 +7,7 @@ States have the names of CiA 402.
 - QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, by VERIFIED: all amplifiers have been
   read back, without a fault and at level zero, after a CLEAR of the same epoch (`find_problem`).
 - COMM_LOST ends with RECONNECTED, once the watchdog of every lost amplifier has certainly expired;
-  it leads to FAULT if anything was latched or energised before.
+  it leads to FAULT if anything was latched or energized before.
 - An event without an entry in the table changes nothing.
 
 Observers are called after the actions of a transition have begun (`deferred_calls`).

@@ -4,7 +4,7 @@ The frequency that a finger already feels is part of its content. It is kept, as
 that finger, unless another frequency serves more fingers.
 
 Moving fingers are solved for a 16 mm stretch of their path, at three points simultaneously: each
-with its own content and quiet for all others. The stretch is centred on the 8 mm between two
+with its own content and quiet for all others. The stretch is centered on the 8 mm between two
 positions: where the change of weights to this answer is half complete, and where the change to the
 next answer will be. The promise is the mean power there over sampled plates, plus an allowance for
 side bands that changing weights cause in other fingers' contents (`model.answer.promise`).

@@ -76,7 +76,7 @@ MARGIN = 1.25
 """Safety factor of the assumed clock errors."""
 
 SETTLED = 10.0
-"""Time [s] that a clock is synchronised before this is logged, with the number of losses."""
+"""Time [s] that a clock is synchronized before this is logged, with the number of losses."""
 
 _FAR_BETTER = 2.0  # ratio to the assumed error
 
@@ -327,7 +327,7 @@ class CountedClocks:
         self._now = now
         self._names = sorted(rig.channel_counts)
         self._counted = EXACT_CLOCKS
-        self._losses = dict.fromkeys(self._names, 0)  # since last logged as synchronised
+        self._losses = dict.fromkeys(self._names, 0)  # since last logged as synchronized
         self._held_since: dict[str, float] = {}  # not logged yet
         self.errors: dict[str, float] = {}
         """Assumed RMS errors [s] by name; empty if all ERAs are on one amplifier."""
@@ -358,7 +358,7 @@ class CountedClocks:
         return table.with_clocks(self._counted)
 
     def _log_settled(self) -> None:
-        """Log which clocks have been synchronised for long enough, with their losses before."""
+        """Log which clocks have been synchronized for long enough, with their losses before."""
         now = threads.now()
         for name, held_since in [*self._held_since.items()]:
             if now - held_since < SETTLED:

@@ -196,7 +196,7 @@ class FingerMotion:
     """The recent path of a finger.
 
     Its velocity is the least-squares slope of its positions over the last 60 ms. Reported positions
-    have errors of a millimetre: a finger whose positions differ by less than 3 mm in that time
+    have errors of a millimeter: a finger whose positions differ by less than 3 mm in that time
     counts as resting.
     """
 

@@ -101,7 +101,7 @@ def _board() -> Iterator[str]:
 def _sensor_and_loop() -> Iterator[str]:
     yield _box(778, 121, 14, 14, fill="#c8e6c9")
     cable = [(360, 288), (440, 288), (440, 306), (670, 306), (670, 128), (778, 128)]
-    yield _line(cable, GREEN, dashes="7 4")  # told from red wires without colours
+    yield _line(cable, GREEN, dashes="7 4")  # told from red wires without colors
     yield _text((676, 300), "accelerometer and its supply: move it", color=GREEN)
     yield _text((676, 316), "to each position, arrow upwards", color=GREEN)
     yield _line([(400, 212), (400, 324), (360, 324)], BLUE)

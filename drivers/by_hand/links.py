@@ -103,7 +103,7 @@ _CLOCKS = "clocks of a smaller clock_error"
 class Arrangement:
     """Amplifiers with ERAs, by name; lines: their lines; errors: RMS errors of their clocks [s].
 
-    remedy: how to synchronise them better; empty if that is impossible.
+    remedy: how to synchronize them better; empty if that is impossible.
     """
 
     lines: str

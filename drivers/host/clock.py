@@ -71,7 +71,7 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
         "let it cool, and check its fan and its load; it may play less, or stop with a fault",
     ),
     "clock_not_steered": (
-        "its clock cannot be steered: its ERAs are not synchronised with those of others",
+        "its clock cannot be steered: its ERAs are not synchronized with those of others",
         "update its firmware, or replace it",
     ),
     "clock_jumped": (

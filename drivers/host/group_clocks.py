@@ -69,7 +69,7 @@ class Clocks:
 
     @property
     def errors(self) -> Mapping[str, float]:
-        """Relative errors of the clocks [s rms] by amplifier; infinite if not synchronised.
+        """Relative errors of the clocks [s rms] by amplifier; infinite if not synchronized.
 
         Each error combines the amplifier's specified error, the measured error of its clock and, if
         lines or amplifiers differ, half of the shortest exchange without its bits, because no

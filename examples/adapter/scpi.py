@@ -125,7 +125,7 @@ class Generator:
         """Send commands in one line; return the replies to the queries among them.
 
         IEEE 488.2 does not number replies. Each line therefore sets and reads the otherwise unused
-        register *ESE, so that a late reply to an earlier line is recognised.
+        register *ESE, so that a late reply to an earlier line is recognized.
         """
         if self._streams is None:
             raise ConnectionError("not connected")

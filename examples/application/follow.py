@@ -1,6 +1,6 @@
 """Hold two fingers on the plate for a while, and print the plate's events.
 
-    python follow.py 0.40,0.23 0.13,0.23      # metres from the south-west corner
+    python follow.py 0.40,0.23 0.13,0.23      # meters from the south-west corner
 
 Each finger gets the effect that the layout has at its position. The daemon must be ready
 (`era status`). The client reconnects and resubscribes automatically. `armed` then renews its lease,

@@ -91,7 +91,7 @@ def _modes(rig: Rig, free: FreePlate, *, name: str, support: str) -> PaperFigure
         colours = {"cmap": "RdBu_r", "shading": "gouraud", "vmin": -1, "vmax": 1}
         deflection = shape.reshape(rows, columns)
         image = axes.pcolormesh(100 * x, 100 * y, deflection, **colours)
-        # Dashed where negative, so that the sign needs no colours.
+        # Dashed where negative, so that the sign needs no colors.
         axes.contour(100 * x, 100 * y, deflection, _CONTOURS, colors="black", linewidths=0.7)
         label_plate(axes)
         if support == "eras":
@@ -165,7 +165,7 @@ def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> Pa
 
 
 def equal_area_points(plate: Plate) -> FloatArray:
-    """Return points [m] (p, 2) that represent equal areas: the centres of nearly square cells.
+    """Return points [m] (p, 2) that represent equal areas: the centers of nearly square cells.
 
     The longer side has 24 cells, or more if the shortest bending wavelength needs them (12 cells).
     Compared with cells of a quarter of the size on the paper's plate, medians differ by up to 3 %,

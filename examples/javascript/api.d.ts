@@ -451,7 +451,7 @@ export interface AmplifierStatus {
   high_voltage: boolean | null;
   /** time since its last reply */
   reply_age_s: number | null;
-  /** RMS error of its clock relative to the others, estimated by the host; null for a single or unsynchronised amplifier */
+  /** RMS error of its clock relative to the others, estimated by the host; null for a single or unsynchronized amplifier */
   clock_skew_us?: number | null;
   /** whether the amplifier does not reply but may still play; no new vibration starts meanwhile */
   degraded?: boolean;

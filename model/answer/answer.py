@@ -277,7 +277,7 @@ class Sensation:
     """Vibration that a finger feels.
 
     Promised values are reached (or for foreign levels, not exceeded) by 90 % of plates within the
-    rig's uncertainty. All others are nominal values of the modelled plate with the fingers on it.
+    rig's uncertainty. All others are nominal values of the modeled plate with the fingers on it.
     Levels are relative to the rig's own threshold set, except for `foreign_level_db_sl`.
     """
 

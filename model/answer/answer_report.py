@@ -189,7 +189,7 @@ def concentration(table: LocalizationTable, layer: Layer, placement: Placement) 
 
 
 def cell_centres(plate: Plate) -> FloatArray:
-    """Return the centres (p, 2) [m] of small equal cells that tile the plate."""
+    """Return the centers (p, 2) [m] of small equal cells that tile the plate."""
     count_x, count_y = (max(1, round(side / _SPACING)) for side in (plate.length, plate.width))
     x = np.linspace(0, plate.length, 2 * count_x + 1)[1::2]
     y = np.linspace(0, plate.width, 2 * count_y + 1)[1::2]
@@ -206,8 +206,8 @@ def concentration_of(
 ) -> Concentration:
     """Evaluate a vibration with amplitudes (f, p) [m/s²] at `cell_centres`, frequencies (f,) [Hz].
 
-    near (p,): centres within 50 mm of a target; felt [m/s²]: mean amplitude at the least driven
-    target. Energy is kinetic, for uniform mass. If all centres are near, contrast is relative to
+    near (p,): centers within 50 mm of a target; felt [m/s²]: mean amplitude at the least driven
+    target. Energy is kinetic, for uniform mass. If all centers are near, contrast is relative to
     all.
     """
     peak = amplitudes.sum(axis=0)

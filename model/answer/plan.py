@@ -98,7 +98,7 @@ def answer(
         limits: of the amplifiers.
 
     A modulated stimulus becomes steady if its modulation would leave a finger unserved, if its side
-    bands do not fit, if it is shared, or if clocks are not synchronised. If stroke and limits do
+    bands do not fit, if it is shared, or if clocks are not synchronized. If stroke and limits do
     not allow all levels, lower priorities are reduced first, and louder ones first among equal
     priorities.
 

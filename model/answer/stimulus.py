@@ -171,7 +171,7 @@ class Finger:
         # Types are tested first: most fingers pass, and calls would take longer.
         if type(self.at) is not tuple or [*map(type, self.at)] != [float, float]:
             _check_pair(
-                self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres"
+                self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in meters"
             )
         for what in ("load", "min_contrast_db", "max_foreign_db_sl"):
             given = getattr(self, what)

@@ -43,7 +43,7 @@ SizeOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 QuietOption = Annotated[
     list[str] | None,
-    typer.Option(metavar="X,Y", help="Position of a quiet finger in metres (repeatable)."),
+    typer.Option(metavar="X,Y", help="Position of a quiet finger in meters (repeatable)."),
 ]
 ContactsOption = Annotated[
     Path | None,
@@ -179,7 +179,7 @@ def seed_of_plate(*, exact: bool, seed: int | None) -> int | None:
 
 
 def figure_size(text: str | None) -> tuple[float, float] | None:
-    """Parse `WxH` in centimetres to the width and height of pictures [in]; None stays None.
+    """Parse `WxH` in centimeters to the width and height of pictures [in]; None stays None.
 
     Raises InputError for other text, and for sides outside 2 to 200 cm.
     """

@@ -142,14 +142,14 @@ def query(
     table_file: TableArgument,
     target: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="Position of a target finger in metres (repeatable)."),
+        typer.Option(metavar="X,Y", help="Position of a target finger in meters (repeatable)."),
     ] = None,
     quiet: QuietOption = None,
     own: Annotated[
         list[str] | None,
         typer.Option(
             metavar="X,Y[@LOW-HIGH]",
-            help="Finger with its own vibration: position in metres and, optionally, a band "
+            help="Finger with its own vibration: position in meters and, optionally, a band "
             "LOW-HIGH or one frequency in Hz (repeatable).",
         ),
     ] = None,
@@ -198,7 +198,7 @@ def query(
         _query_batch(table_file, batch, defaults)
         return
     no_target = (
-        "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "
+        "targets must be at least one, got none; give --target X,Y or --own X,Y, meters, or "
         "--batch FILE"
     )
     for is_wrong, said in (
@@ -384,7 +384,7 @@ def contrast_map(
     table_file: TableArgument,
     quiet: Annotated[
         list[str],
-        typer.Option(metavar="X,Y", help="Position of a quiet finger in metres (repeatable)."),
+        typer.Option(metavar="X,Y", help="Position of a quiet finger in meters (repeatable)."),
     ],
     modes: Annotated[
         str | None,

@@ -138,7 +138,7 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
         yield f"± {median:.1f} dB from the sampled other fingers; 10th percentile ± {tenth:.1f} dB"
     yield from text_map(cells)
     if listed:
-        yield "\nweak cells: centre, contrast to the other finger: median, 10th percentile"
+        yield "\nweak cells: center, contrast to the other finger: median, 10th percentile"
         for (x, y), median, tenth in zip(
             cells.centres[cells.weak],
             cells.median_db[cells.weak],

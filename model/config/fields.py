@@ -376,7 +376,7 @@ class Rectangle:
 
     @property
     def centre(self) -> _Point:
-        """The centre of area."""
+        """The center of area."""
         return (self.x + self.width / 2, self.y + self.height / 2)
 
     def corners(self) -> Sequence[_Point]:
@@ -409,7 +409,7 @@ class Circle:
 
     @property
     def centre(self) -> _Point:
-        """The centre."""
+        """The center."""
         return (self.x, self.y)
 
     def corners(self) -> Sequence[_Point]:
@@ -456,7 +456,7 @@ class Polygon:
 
     @property
     def centre(self) -> _Point:
-        """The centre of area, or the mean of the corners where sides cross out the area."""
+        """The center of area, or the mean of the corners where sides cross out the area."""
         following = (*self.points[1:], self.points[0])
         cross = [
             x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(self.points, following, strict=True)
@@ -481,7 +481,7 @@ class Polygon:
 
 
 RegionShape: TypeAlias = Rectangle | Circle | Polygon
-"""A part of the plate; lengths in metres, from the plate's south-west corner."""
+"""A part of the plate; lengths in meters, from the plate's south-west corner."""
 
 
 def _is_on_side(x: float, y: float, start: _Point, end: _Point) -> bool:
@@ -507,7 +507,7 @@ class RectangleSection(Section):
 
 
 class CircleSection(Section):
-    """A centre and a radius."""
+    """A center and a radius."""
 
     at: PointSection
     radius: Annotated[float, Quantity(LENGTH, above=0, at_most=10)]

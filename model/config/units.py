@@ -217,7 +217,7 @@ def parse_point(text: str, *, what: str) -> tuple[float, float]:
         x, y = (float(part) for part in parts)
     except ValueError:
         raise InputError(
-            f"{what} must be X,Y in metres without a unit, such as {what} 0.10,0.08, got {text!r}"
+            f"{what} must be X,Y in meters without a unit, such as {what} 0.10,0.08, got {text!r}"
         ) from None
     if not (math.isfinite(x) and math.isfinite(y)):
         raise InputError(f"{what}: both coordinates must be finite, got {text!r}")
@@ -233,7 +233,7 @@ def in_metres(x: float, y: float, *, length: float, width: float) -> str:
         sides = ((x, length), (y, width))
         if all(at == 0 or 1 <= at <= count * side for at, side in sides):
             return (
-                f"; positions are in metres: for {x:g} {unit}, {y:g} {unit} write "
+                f"; positions are in meters: for {x:g} {unit}, {y:g} {unit} write "
                 f"{x / count:g},{y / count:g}"
             )
     return ""

@@ -347,7 +347,7 @@ def with_places(
     """Include position errors of the sources in a plate, as larger errors of their stiffness.
 
     Also return the remaining mean square error (f, n) of each source's field [(m/s²)²], at full
-    stroke, on the modelled plate without fingers. shifts (n, 2, r): change of the shapes at the
+    stroke, on the modeled plate without fingers. shifts (n, 2, r): change of the shapes at the
     sources per standard deviation along x and y; gram (r, r): mean product of the shapes where
     fingers rest; by_field (n,): whether couples count as errors of the field.
     """

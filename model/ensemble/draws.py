@@ -63,7 +63,7 @@ class Draws:
     gains: Complex64Array
     """Relative change (a, d) of the gain of each ERA, 0 elsewhere."""
     errors: Complex64Array
-    """Discretisation error (k, d) at each finger, of mean square 1."""
+    """Discretization error (k, d) at each finger, of mean square 1."""
     harmonics: Complex64Array
     """Second harmonic (n, d) of each ERA relative to its motion."""
     node: IntArray
@@ -201,9 +201,9 @@ class ClockErrors:
 
     @property
     def groups(self) -> tuple[int, ...]:
-        """Group of each ERA (n,): 0 for all with synchronised clocks, then one per amplifier.
+        """Group of each ERA (n,): 0 for all with synchronized clocks, then one per amplifier.
 
-        Empty if all are synchronised. A content plays on the ERAs of a single group.
+        Empty if all are synchronized. A content plays on the ERAs of a single group.
         """
         alone = [number for number, each in enumerate(self.errors) if each > MAX_HELD]
         if not alone:
@@ -216,7 +216,7 @@ class ClockErrors:
         )
 
     def power_shares(self, frequencies: FloatArray) -> Float32Array | None:
-        """Share (f, n, n) by which delays increase the modelled power of pairs of ERAs; None if
+        """Share (f, n, n) by which delays increase the modeled power of pairs of ERAs; None if
         exact.
 
         Relative to the mean over the delays: exp(p²) - 1 for ERAs of one amplifier, with p = 2 pi f

@@ -139,7 +139,7 @@ def touch(
 ) -> TouchedPlate:
     """Put fingers on a plate, using C kernels if they can be compiled.
 
-    centres (k, r): shapes there; loads (k,): relative to the rig's fingertip, empty for 1 each;
+    centers (k, r): shapes there; loads (k,): relative to the rig's fingertip, empty for 1 each;
     clocks: errors of the amplifiers' clocks.
     """
     library = kernels()

@@ -1,6 +1,6 @@
 """Fingers on a plate on its ERAs, and the vibration that they feel on drawn plates, in numpy.
 
-k fingers of dynamic stiffness D at centres c change fields X of a plate on its ERAs to
+k fingers of dynamic stiffness D at centers c change fields X of a plate on its ERAs to
 
     X - G D P X_c,  P = (1 + G_cc D)^-1,
 
@@ -134,7 +134,7 @@ class _Fingers:
     stiffness: Complex64Array
     """D (c, k) [N/m]."""
     response: Complex64Array
-    """T at the fingers' centres (c, k, b), without the fingers."""
+    """T at the fingers' centers (c, k, b), without the fingers."""
     displacement: Complex64Array
     """G (c, k, r)."""
     share: Complex64Array
@@ -219,7 +219,7 @@ class TouchedPlate:
 
         points (g, p, r), fine (g, fine, r): shapes at groups of points, as under each finger;
         weights (g, p): of a group's points, sum 1; error_power (all, n): mean square of the
-        discretisation error of each ERA's field at all frequencies of the plate.
+        discretization error of each ERA's field at all frequencies of the plate.
         """
         plate = self.plate_on_eras.plate
         modelled = np.full(len(rows), MODELLED)
@@ -352,7 +352,7 @@ class TouchedPlate:
 
         weights (m, n): of the ERAs; points (k p, r): shapes; shares (k, p): of the points in the
         mean over a fingertip. At all frequencies of the plate: error_power (f, n), mean square of
-        the discretisation error of each ERA's field; threshold (f,) [m/s²].
+        the discretization error of each ERA's field; threshold (f,) [m/s²].
         """
         plates = DrawnPlates.of(self.plate_on_eras, len(shares), drawing)
         draws = plates.draws

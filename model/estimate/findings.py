@@ -239,7 +239,7 @@ FINDING_KINDS = {
     "thickness": FindingKind(
         "THICKNESS: according to its sensors, the plate is {along_x} thicker at the end of x and "
         "{along_y} at the end of y than in its middle: check it, or the sensors' scales",
-        "the plate is thicker at one end, or the sensors' scales rise towards it",
+        "the plate is thicker at one end, or the sensors' scales rise toward it",
         "form",
     ),
     "unnamed": FindingKind(

@@ -60,7 +60,7 @@ _MAX_GROUPS = 12  # of rows by amplitude, each with its own noise
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Most likely parameters of a model for a measurement, and the linearised fit at that point.
+    """Most likely parameters of a model for a measurement, and the linearized fit at that point.
 
     Residuals and slopes are in standard deviations, after applying the soft loss, if any.
     """
@@ -251,7 +251,7 @@ def _linearised(
     prior: tuple[FloatArray, FloatArray],
     soft: float | None,
 ) -> Fit:
-    """Linearise a fit at x (p,), without its cost; own (p,): mask of the searched parameters.
+    """Linearize a fit at x (p,), without its cost; own (p,): mask of the searched parameters.
 
     prior: mean (q,) and root of the inverse covariance (q, q) of the searched parameters.
     """
@@ -282,7 +282,7 @@ def best_gains(
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
     """Eliminate the best gains from a model's responses (f, s, n) and their slopes (f, s, n, q).
 
-    Gains with a stated deviation are drawn towards magnitude 1.
+    Gains with a stated deviation are drawn toward magnitude 1.
 
     Returns gains (f, n), their slopes (f, n, q), and for the m values the residuals in standard
     deviations (m,) with their slopes (m, q).

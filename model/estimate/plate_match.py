@@ -486,7 +486,7 @@ def compared(match: Match) -> list[Hypothesis]:
 def _refined(
     factors: Sequence[float], factor: float, match: Match, matched: Callable[[float], Match | None]
 ) -> Match:
-    """Search for the best factor between the neighbours of a factor in a range."""
+    """Search for the best factor between the neighbors of a factor in a range."""
     padded = (factors[0] / 1.5, *factors, factors[-1] * 1.5)
     at, known = 1 + factors.index(factor), [match]
 
@@ -540,7 +540,7 @@ def match_with_form(match: Match) -> tuple[Match, list[Load]]:
 
 
 def linearised(match: Match) -> Fit:
-    """Return the fit of a match, linearised with free gains at every frequency."""
+    """Return the fit of a match, linearized with free gains at every frequency."""
     kept = np.where(match.outliers, np.nan, match.values)
     errors = _errors(kept, match.model_error)
     measured = replace(match.fit.measurement, values=kept, errors=errors, gain_std=math.inf)

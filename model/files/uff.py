@@ -52,7 +52,7 @@ _FIELDS = {
     "orddenom_axis_units_lab": (10, 47, 67, str),
 }
 _SI = 1  # units code of dataset 164
-_NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimetres, centimetres, inches
+_NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimeters, centimeters, inches
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
 _BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
 _HEADER = re.compile(
@@ -399,7 +399,7 @@ def _quoted(row: bytes) -> str:
 
 
 def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
-    """By what lengths and forces of the file are divided to have metres and newtons."""
+    """By what lengths and forces of the file are divided to have meters and newtons."""
     place = f"{path}:{block.line}"
     rows = block.rows[1:]
     code = numbers_in(rows[0][:10], f"{path}:{block.line + 2}") if rows else []

@@ -1,6 +1,6 @@
 """Free plate, solved once for all ERAs, fingers and masses that can be attached at points.
 
-Modes of the free plate up to twice the highest frequency come from one factorisation for each
+Modes of the free plate up to twice the highest frequency come from one factorization for each
 symmetry class; the contribution of the truncated modes takes a few more solves with the same
 factors for each point of attachment, cached. On a mesh of elements these are solved for on demand;
 with polynomials all modes of the deflection are known, and the truncated ones are summed directly.
@@ -124,7 +124,7 @@ _MAX_KEPT_BYTES = 1 << 26  # of residual vectors; residual vectors of a map's ra
 class FiniteElementModes:
     """All modes of a free plate on a mesh below a cut-off; see `FreeModes`.
 
-    shift [rad²/s²]: of the factorisation; cutoff_frequency [Hz].
+    shift [rad²/s²]: of the factorization; cutoff_frequency [Hz].
     """
 
     def __init__(self, plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float) -> None:
@@ -423,7 +423,7 @@ FREQUENCY_MARGIN = 2.0
 class FreePlate:
     """Modes and factors of a plate on a mesh; see `solve_free_plate`.
 
-    frequency_max [Hz]: upper limit of the response; shift [rad²/s²]: of the factorisations.
+    frequency_max [Hz]: upper limit of the response; shift [rad²/s²]: of the factorizations.
     """
 
     plate: Plate

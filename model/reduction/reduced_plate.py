@@ -335,7 +335,7 @@ class SupportedModes:
             places = np.empty(0)
         if places.shape[-1:] != (2,) or places.ndim > 2:
             raise InputError(
-                f"points must be positions on the plate, got {shown(points)}; give x, y in metres, "
+                f"points must be positions on the plate, got {shown(points)}; give x, y in meters, "
                 "as in [[0.1, 0.08]]"
             )
         return np.asarray(self.reduced.at(places) @ self.coordinates)
@@ -376,7 +376,7 @@ def place_slopes(
     step = _STEP * sides
     is_inner = np.minimum(at, sides - at)[:, 0] >= step
     inwards = np.where(at[:, 0] > sides / 2, -1.0, 1.0)
-    # Offsets of two neighbouring points, and the weights of these and of the point itself, (n, 2)
+    # Offsets of two neighboring points, and the weights of these and of the point itself, (n, 2)
     # each.
     first, second = np.where(is_inner, 1.0, inwards), np.where(is_inner, -1.0, 2 * inwards)
     own = np.where(is_inner, 0.0, -1.5 * inwards)

@@ -327,7 +327,7 @@ class Rig:
 
 
 MAY_DIFFER = {
-    "Rig.mesh": "the discretisation error of its own mesh is part of a table",
+    "Rig.mesh": "the discretization error of its own mesh is part of a table",
     "Rig.wiring": "affects where levels go, not their effect",
     "Rig.amplifiers": "affects where levels go, not their effect",
     "Rig.limits": "checked against the rig in service whenever a pattern is played",
@@ -444,7 +444,7 @@ _OTHERS = (
     EraLayout("opposite corners", ((0, 0), (1, 1))),
     EraLayout("mid-short-edges", ((0, 1 / 2), (1, 1 / 2))),
     EraLayout("triangle", ((0, 0), (1, 0), (1 / 2, 1))),
-    EraLayout("corners and centre", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
+    EraLayout("corners and center", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
     EraLayout(
         "corners and mid-long-edges", ((0, 0), (1 / 2, 0), (1, 0), (1, 1), (1 / 2, 1), (0, 1))
     ),

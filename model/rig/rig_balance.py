@@ -14,7 +14,7 @@ TOUCH_FORCE = 1.0
 """Force [N] of a firm touch, which should not tip a plate (docs/concepts/people.md)."""
 
 _NEAR_EDGE = 0.1
-"""Fraction of the supports' extent within which a centre of mass is near their edge."""
+"""Fraction of the supports' extent within which a center of mass is near their edge."""
 
 _LIFTS = -1e-6  # N; lower loads mean that a support is pulled upwards
 _EDGES = "edges"  # name of supports along all edges
@@ -58,7 +58,7 @@ class RigBalance:
     def notes(self) -> Iterator[str]:
         """Yield warnings of a plate that tips over, nearly tips over, or lifts off a support."""
         balance = self._balance
-        centre = f"the centre of mass, {_millimetres(balance.centre)},"
+        centre = f"the center of mass, {_millimetres(balance.centre)},"
         where = f"{'eras' if self._rests_on_eras else 'supports'}"
         if self.tips_over:
             yield (
@@ -70,7 +70,7 @@ class RigBalance:
             if load < _LIFTS:
                 yield (
                     f"{where}.{name}: carries {load:.2g} N, so the plate lifts off it, or pulls at "
-                    "it; move it towards the centre of mass, at "
+                    "it; move it toward the center of mass, at "
                     f"{_millimetres(balance.centre)}, or make it softer"
                 )
         if balance.inside_share < _NEAR_EDGE:

@@ -128,7 +128,7 @@ def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
     if sag > one.excursion:
         yield (
             f"resonance: of {one.magnet_frequency:.3g} Hz when glued, at which the magnet sags "
-            f"{1e3 * sag:.2g} mm from its centre under its weight, with an excursion of "
+            f"{1e3 * sag:.2g} mm from its center under its weight, with an excursion of "
             f"{1e3 * one.excursion:.2g} mm; check resonance, resonance_is and weight, or hold it"
         )
     highest = limits.frequency_max

@@ -481,7 +481,7 @@ class SurfaceSection(Section):
     """
 
     normal: Literal["x", "y", "z", "-x", "-y", "-z", "local x", "local y", "local z"] = "z"
-    """Direction from the surface towards the fingers, in axes of the file; `local z` for the normal
+    """Direction from the surface toward the fingers, in axes of the file; `local z` for the normal
     at each node of a curved surface.
     """
 

@@ -317,14 +317,14 @@ _UNRESOLVED = 0.9
 _CURVATURE = 1  # how far below it the wave of what is missing is
 
 _CORNER = 4.0  # bending at a corner, times the infinite plate's
-_TO_CENTROID = 0.5  # where a disc that is cut by an edge acts, between its centre and its centroid
+_TO_CENTROID = 0.5  # where a disc that is cut by an edge acts, between its center and its centroid
 _LEAST_SINE = 1.5  # times 1 / p: nearest to its end that a polynomial resolves ever finer
 _DIRECTIONS = (np.arange(32) + 0.5) * np.pi / 64
 _COS2, _SIN2 = np.cos(_DIRECTIONS) ** 2, np.sin(_DIRECTIONS) ** 2
 _UNCERTAIN = 0.2  # relative; twice the error of the estimate
 _ON_FOOT = 0.5  # least share of a point's that is taken for a disc, which an edge may cut
 # k d beyond which forces share no unresolved wave: the fourth zero of `_decay`. The shared
-# compliance fades towards it, since a field with a step or a kink cannot be interpolated.
+# compliance fades toward it, since a field with a step or a kink cannot be interpolated.
 _FAR = 13.603179753989906
 
 # Gauss points of ln t, t = 1 to 100, for integrals over dt / t: footprints leave little beyond.
@@ -599,7 +599,7 @@ class SpectralMesh(Discretisation):
         return math.pi * max(sides)
 
     def finer(self) -> Self:
-        """Degrees to compare with, for the discretisation error."""
+        """Degrees to compare with, for the discretization error."""
         return replace(self, nx=self.nx + _FINER, ny=self.ny + _FINER)
 
     def resolving(self, plate: Plate, frequency: float) -> Self:

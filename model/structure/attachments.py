@@ -263,7 +263,7 @@ HAND_STD = 1.1
 """Standard deviation of the logarithm of the load of each patch of a hand, a factor of 3."""
 
 HAND_PATCHES = ((-0.0125, -0.0125), (0.0125, -0.0125), (-0.0125, 0.0125), (0.0125, 0.0125))
-"""Patches on which a hand of `HAND_LOAD` rests, each with a quarter of the load, from its centre
+"""Patches on which a hand of `HAND_LOAD` rests, each with a quarter of the load, from its center
 [m].
 
 Patches of a heavier hand are farther apart, by the square root of its load.
@@ -403,7 +403,7 @@ def fingertip_loads(
 class PointLoad:
     """A spring and a damper to the ground, and a mass, on a point or a disc of the plate.
 
-    It follows the mean deflection of a disc; its rotary inertia is not modelled.
+    It follows the mean deflection of a disc; its rotary inertia is not modeled.
     """
 
     x: float  # m, as y
@@ -567,7 +567,7 @@ def as_footprints(places: FloatArray) -> FloatArray:
 
 
 def check_footprints_on_plate(places: FloatArray, *, length: float, width: float) -> None:
-    """Check that points (n, 2) or the centres of footprints (n, 3) [m] are on the plate.
+    """Check that points (n, 2) or the centers of footprints (n, 3) [m] are on the plate.
 
     Its edges included; raises InputError.
     """
@@ -672,7 +672,7 @@ def static_loads(
 
 
 def centre_of_mass(plate: Plate) -> Point:
-    """Return the centre of mass of the bare plate [m]: its centre, or a surface's, from its
+    """Return the center of mass of the bare plate [m]: its center, or a surface's, from its
     modes."""
     if plate.surface is not None:
         centre = centre_of_surface(plate.surface)

@@ -1,7 +1,7 @@
-"""Static balance of a rigid plate on its supports: centre of mass, static loads, and tipping.
+"""Static balance of a rigid plate on its supports: center of mass, static loads, and tipping.
 
 Supports are springs to the ground: ERAs, held exciters and feet. A foot only pushes; bolted or
-glued supports can also pull. The plate tips if its centre of mass is outside the convex hull of the
+glued supports can also pull. The plate tips if its center of mass is outside the convex hull of the
 supports. A finger that presses outside the hull tips the plate over an edge of the hull.
 """
 
@@ -29,7 +29,7 @@ class Balance:
     weight: float
     """Weight of the plate and everything that moves with it [N]."""
     centre: Point
-    """Centre of mass [m]."""
+    """Center of mass [m]."""
     supports: FloatArray
     """Positions of the supports (n, 2) [m]."""
     loads: FloatArray
@@ -45,7 +45,7 @@ class Balance:
 
     @property
     def inside(self) -> float:
-        """Distance of the centre of mass to the nearest edge [m], negative outside the hull."""
+        """Distance of the center of mass to the nearest edge [m], negative outside the hull."""
         return float(np.min(-_distances(self.edges, self.centre)))
 
     @property
@@ -61,7 +61,7 @@ class Balance:
     def tipping_force(self, points: Iterable[Point]) -> tuple[float, Point] | None:
         """Return the smallest force [N] on any given point [m] that tips the plate, and the point.
 
-        None if no point is outside the hull. The centre of mass must be within it.
+        None if no point is outside the hull. The center of mass must be within it.
         """
         edges = self.edges
         holding = -self.weight * _distances(edges, self.centre)  # N m, about each edge

@@ -13,7 +13,7 @@ nearly the same at every frequency. A data sheet usually states the resonance of
 against the magnet, `free`. When glued to a plate the magnet moves, at f_m = f_s sqrt(m_s / M), m_s
 the moving mass in the data sheet.
 
-Not modelled: amplitude dependence of stiffness and damping, heating of the coil (0.39 % of R_e per
+Not modeled: amplitude dependence of stiffness and damping, heating of the coil (0.39 % of R_e per
 kelvin), eddy currents, rocking of the magnet.
 """
 

@@ -1,4 +1,4 @@
-"""A material, and the catalogue of materials and of exciters by name, each with its source.
+"""A material, and the catalog of materials and of exciters by name, each with its source.
 
 An installed package adds a material through an entry point of the group `era_haptics.materials`
 that refers to a `KnownMaterial` with that name; rig files, their schema and `era plate materials`

@@ -25,7 +25,7 @@ with the mean velocity v over the depth d and the plate's deflection w away from
 becomes 12 mu / (iωρ d²) + 6/5, the squeeze film of Reynolds' equation, and air is isothermal; fast,
 b = 1, and it is adiabatic. Holds while the gap is narrow compared with waves and with the plate.
 
-Not modelled: layers that change their thickness, as a foam does under a force at a point; change of
+Not modeled: layers that change their thickness, as a foam does under a force at a point; change of
 an adhesive with temperature; air between loose layers.
 """
 

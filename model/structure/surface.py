@@ -10,7 +10,7 @@ The mass is the mass in rigid motion along the normal: with modes phi of unit mo
 coefficients c such that sum c phi = 1, it is |c|². Mounts that hold the surface must be included
 either in the modes or in the rig, not in both.
 
-Not modelled: in-plane forces and motion, including the actuators'.
+Not modeled: in-plane forces and motion, including the actuators'.
 """
 
 import hashlib
@@ -51,7 +51,7 @@ _HELD = 0.2  # normal motion of a rigid mode, relative to the mode with the most
 _SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
 _TILTING = 3  # rigid modes of a surface that is free: it moves along the normal and tilts
 _FEWEST = 6  # nodes, and elastic modes
-_BESIDE = 9  # neighbouring nodes that define the plane for a normal
+_BESIDE = 9  # neighboring nodes that define the plane for a normal
 _ON_OUTLINE = 1e-3  # m; a place so near to it is on the surface
 _SAME_MASS = 0.1
 _SAME_LOSS = 0.01
@@ -141,7 +141,7 @@ def digest_of_file(path: Path) -> str:
 
 
 def centre_of_surface(surface: Surface) -> Point | None:
-    """Return the centre of mass [m] of a surface; None unless its rigid body is free to tilt."""
+    """Return the center of mass [m] of a surface; None unless its rigid body is free to tilt."""
     if surface.rigid < _TILTING:
         return None
     return _centre(surface.file, surface.digest, surface.normal)
@@ -149,7 +149,7 @@ def centre_of_surface(surface: Surface) -> Point | None:
 
 @lru_cache(maxsize=4)
 def _centre(file: str, digest: str, normal: str) -> Point | None:
-    """Compute the centre of mass [m] of a free surface from its rigid modes.
+    """Compute the center of mass [m] of a free surface from its rigid modes.
 
     Modes of unit modal mass are P T, where P has a row (1, x, y) for each node: then the mass and
     the first and second moments of the surface are (T T')^-1.
@@ -246,7 +246,7 @@ def evenly_spaced(points: FloatArray, count: int) -> FloatArray:
 
 
 def _normals(nodes: FloatArray, axis: int) -> FloatArray:
-    """Return unit normals (n, 3) at nodes: of the best-fit plane of each node's neighbours, along
+    """Return unit normals (n, 3) at nodes: of the best-fit plane of each node's neighbors, along
     an axis."""
     from scipy.spatial import cKDTree  # only curved surfaces need it
 

@@ -51,7 +51,7 @@ _RIGID_SCALE_LIMIT = 50.0
 """Limit for rigid-body modes; measured: 0.09 to 2.7 if the nodes cover a quarter of the part."""
 
 _NORMALISED_SCALE = 1.4
-"""Limit for shapes that look normalised in another way; measured: 0.97 to 1.03 on even plates."""
+"""Limit for shapes that look normalized in another way; measured: 0.97 to 1.03 on even plates."""
 
 _SAME_VALUE = 5e-4  # relative difference after rounding to four digits
 _MIN_TIES, _TIES, _NEARLY_ALL = 3, 0.2, 0.9  # modes with the same value; shares of all modes
@@ -94,9 +94,9 @@ def check_surface(file: str, digest: str, normal: str, mass: float | None) -> tu
 
 
 def _check_sides(shapes: SurfaceShapes) -> Iterator[str]:
-    """Check that the surface has a plausible size in metres."""
+    """Check that the surface has a plausible size in meters."""
     longer = float(shapes.size.max())
-    what = f"sides must be in metres, got {_sides(shapes.size)} m"
+    what = f"sides must be in meters, got {_sides(shapes.size)} m"
     units = [
         f"{_sides(shapes.size * factor)} m if they are in {unit}"
         for unit, factor in _UNITS.items()
@@ -104,7 +104,7 @@ def _check_sides(shapes: SurfaceShapes) -> Iterator[str]:
     ]
     guess = f" ({', '.join(units)})" if units else ""
     remedy = (
-        "convert nodes and places to metres, and shapes with them; a universal file states its "
+        "convert nodes and places to meters, and shapes with them; a universal file states its "
         "units in dataset 164"
     )
     if not _MIN_SIDE <= longer <= _MAX_SIDE:
@@ -280,7 +280,7 @@ def _is_near_one(values: Sequence[float], factor: float) -> bool:
 
 
 def _normalisation(modes: ModeShapes) -> str:
-    """Describe a normalisation other than to unit modal mass; empty if there is no sign of another.
+    """Describe a normalization other than to unit modal mass; empty if there is no sign of another.
 
     The common value of all modes is a power of ten, or its root if units of mass were converted.
     """
@@ -294,7 +294,7 @@ def _normalisation(modes: ModeShapes) -> str:
         # The largest value of some modes may be at nodes that were not exported.
         ties = int(_is_same(largest, largest.max()).sum())
         if ties >= max(_MIN_TIES, _TIES * count) and _is_round(float(largest.max())):
-            return f"normalised to their largest value ({ties} of {count} modes have the same)"
+            return f"normalized to their largest value ({ties} of {count} modes have the same)"
     for what, values in (
         ("to unit length", sizes),
         ("to their mean square", sizes / math.sqrt(len(modes.nodes))),
@@ -302,13 +302,13 @@ def _normalisation(modes: ModeShapes) -> str:
         middle = float(np.median(values))
         ties = int(_is_same(values, middle).sum())
         if ties >= _NEARLY_ALL * count and _is_round(middle):
-            return f"normalised {what} ({ties} of {count} modes)"
+            return f"normalized {what} ({ties} of {count} modes)"
     of_last, of_next = np.abs(shapes[-1]), np.abs(shapes[-2])
     is_candidate = _is_same(of_next, of_last)
     same = _is_same(np.abs(shapes[:, is_candidate]), of_last[is_candidate])
     ties = int(same.sum(axis=0).max(initial=0))
     if ties >= _NEARLY_ALL * count:
-        return f"normalised to one node ({ties} of {count} modes have the same value there)"
+        return f"normalized to one node ({ties} of {count} modes have the same value there)"
     return ""
 
 

@@ -33,7 +33,7 @@ from model.vibration import Excitation, base_amplitudes
 
 @dataclass(frozen=True, eq=False)
 class Plates:
-    """Parameters of d plates, as factors relative to the modelled one unless stated otherwise."""
+    """Parameters of d plates, as factors relative to the modeled one unless stated otherwise."""
 
     thickness: FloatArray
     """Thickness (d,) of the plate."""
@@ -174,7 +174,7 @@ def amplitudes_on(
 ) -> tuple[FloatArray, FloatArray]:
     """Return frequencies (f,) [Hz] and amplitudes (f, points, d) [m/s²] on untouched plates.
 
-    points: in metres. plates: drawn with as many contacts as points; their loads have no effect.
+    points: in meters. plates: drawn with as many contacts as points; their loads have no effect.
     """
     shapes = table.shapes_at(points)[:, None]
     rows, accelerations = _responses(table, shapes, (), excitation, plates)

@@ -1,6 +1,6 @@
 """Where a plate's fingers are told apart: promised contrast of each cell to random other fingers.
 
-For the centre of each cell as the target, the promised contrast (90 % of plates) to another finger
+For the center of each cell as the target, the promised contrast (90 % of plates) to another finger
 at random positions at least 5 cm away. A cell is *feasible* if the median other finger leaves 12 dB
 at 20 dB SL: at 12 dB SL, which is clearly felt, the other finger is then at its threshold. It is
 *weak* if the contrast is lower for more than 10 % of the other fingers.
@@ -67,7 +67,7 @@ class WeakCells:
 
     grid: Grid
     centres: FloatArray
-    """Centres (cells, 2) of the cells [m]."""
+    """Centers (cells, 2) of the cells [m]."""
     median_db: FloatArray
     """Median (cells,) over other fingers."""
     tenth_db: FloatArray

@@ -136,7 +136,7 @@ class Raster:
         return lattice(self.x, self.y)
 
     def fingertips(self, centres: FloatArray, values: Float32Array) -> "FingertipShapes":
-        """Values (point_count, r) at the fingertips centred at (k, 2) [m] on the plate."""
+        """Values (point_count, r) at the fingertips centered at (k, 2) [m] on the plate."""
         points, weights = fingertips_on(
             centres, length=self.length, width=self.width, rule=FIVE_AND_FINE
         )
@@ -195,7 +195,7 @@ class Raster:
         return found
 
     def _patches(self, centres: FloatArray, points: FloatArray) -> tuple[IntArray, Float32Array]:
-        """Raster points around centres (k, 2), and their weights at points (k, p, 2) nearby.
+        """Raster points around centers (k, 2), and their weights at points (k, p, 2) nearby.
 
         (k, patch) and (k, p, patch).
         """
@@ -215,7 +215,7 @@ class Raster:
 class FingertipShapes:
     """Shapes (k, p, r) under k fingertips and weights (k, p) of the points in the mean over each.
 
-    At few points for searches and at fine ones for figures; the centre comes first.
+    At few points for searches and at fine ones for figures; the center comes first.
     """
 
     few: Float32Array
@@ -239,7 +239,7 @@ SAME_FREQUENCY = 1e-3
 """Distance [Hz] of two frequencies that are one."""
 
 BACKGROUND_CELL, CELLS_PER_WAVELENGTH = 0.0254, 4
-"""Largest side [m] of the cells by whose centres the power of the plate around targets counts, that
+"""Largest side [m] of the cells by whose centers the power of the plate around targets counts, that
 of the founding paper's cells; and how many a bending wave has at least."""
 
 
@@ -395,13 +395,13 @@ class LocalizationTable:
 
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
-        """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
+        """Highest level [dB SL] of any `switched` pattern at the center of each cell, (cells,)."""
         fields = self.unit_fields(self.cell_centres).transpose(2, 0, 1) / self.thresholds[:, None]
         return decibels(highest_levels(fields[:, None]).astype(float))
 
     @cached_property
     def cell_centres(self) -> FloatArray:
-        """Centres of the grid's cells [m] that are on the plate, (cells, 2)."""
+        """Centers of the grid's cells [m] that are on the plate, (cells, 2)."""
         centres = self.grid.centres(self.plate)
         return centres[self.plate.covers(centres)]
 
@@ -592,7 +592,7 @@ class LocalizationTable:
 
     @cached_property
     def field_error_power(self) -> Float32Array:
-        """The same over the plate, from discretisation and the rig's uncertainty.
+        """The same over the plate, from discretization and the rig's uncertainty.
 
         Includes its `field`, and an object of its `foreign_mass`, averaged over possible positions.
         """
@@ -685,7 +685,7 @@ _FEW, _FINE = len(FIVE_POINTS.points), len(FINE_POINTS.points)
 
 
 def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> FingertipShapes:
-    """Return shapes at fingertips centred at positions [m], with a C kernel if available."""
+    """Return shapes at fingertips centered at positions [m], with a C kernel if available."""
     by = kernels()
     if by is None:
         return table.raster.fingertips(np.array(places), table.shapes)

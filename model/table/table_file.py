@@ -311,7 +311,7 @@ class TableProblem:
 
     @property
     def reference_mesh(self) -> PlateMesh:
-        """Finer mesh for the discretisation error."""
+        """Finer mesh for the discretization error."""
         return finer_mesh(
             self.rig.plate,
             self.rig.mesh,
@@ -361,7 +361,7 @@ def solve_table(
     progress: Progress = unseen,
     is_estimated: bool = True,
 ) -> LocalizationTable:
-    """Solve modes and discretisation error by several processes.
+    """Solve modes and discretization error by several processes.
 
     progress: called with the number of finished parts and the total; is_estimated: unless the error
     is taken for none, which takes a tenth of the time. Raises InputError.

@@ -1,4 +1,4 @@
-"""Optimal knots of onsets and endings, which minimise the vibration at fingers and over the plate.
+"""Optimal knots of onsets and endings, which minimize the vibration at fingers and over the plate.
 
 Forms are over knots and ERAs, knots * eras rows, ERAs running fastest; amplitudes are in strokes.
 Gains and phases of the ERAs are known to a few percent and degrees only (the rig's `uncertainty`):
@@ -294,7 +294,7 @@ def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
     """Return the Hermitian form W (2 r, 2 r) of a free vibration's mean square over T [s].
 
     z0^H W z0 = 2 <(1/T) int |q''|^2 dt>, mean over the phase of the state z0 at the start. With
-    mass-normalised coordinates |q''|^2 is the plate's mass times its mean square acceleration.
+    mass-normalized coordinates |q''|^2 is the plate's mass times its mean square acceleration.
     """
     rates = plate.eigenvalues.conj()[:, None] + plate.eigenvalues
     shapes = plate.own_acceleration.conj().T @ plate.own_acceleration
@@ -311,7 +311,7 @@ ITERATIONS = 30
 def bounded_minimum(
     form: _ComplexArray, right: _ComplexArray, combinations: Complex64Array
 ) -> ComplexArray:
-    """Minimise x^H form x - 2 Re right^H x such that no ERA exceeds its stroke; return the knots.
+    """Minimize x^H form x - 2 Re right^H x such that no ERA exceeds its stroke; return the knots.
 
     form: positive semidefinite, over knots and combinations; right (k, c); combinations (eras, c):
     orthonormal. Returns knots (k, eras): the unbounded solution if it is within the bounds, else

@@ -5,7 +5,7 @@ raised cosine and each quiet fingertip stays still, from the first millisecond u
 settled.
 
 Ending: the plate's mean square over the time after the last knot is a quadratic form of its state
-then, and so of the knots; the ending minimises it. It depends neither on the contacts nor on the
+then, and so of the knots; the ending minimizes it. It depends neither on the contacts nor on the
 phase of the carrier at that moment. Known quiet fingers are kept quiet during the ending, too:
 stopping the plate takes other vibrations than the pattern's.
 
@@ -221,7 +221,7 @@ class Shaper:
 
         gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`); fingertips: reads
         shapes under fingertips, None to read them point by point; magnets: of its exciters, None
-        for those of the plate as modelled.
+        for those of the plate as modeled.
         """
         self._plate = plate
         self._read_fingertips = fingertips or partial(_fingertips_on, plate)

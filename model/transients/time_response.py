@@ -6,7 +6,7 @@ q are the coordinates of the reduced free plate and the displacements of the pha
 it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
 `model.reduction.reduced_plate`. For exciters y is the voltage, k_b and c are the forces by it and
 by its rate that push plate and magnet apart, and q includes the displacements of their magnets. The
-first-order system is diagonalised once for each set of attachments. There are three kinds of
+first-order system is diagonalized once for each set of attachments. There are three kinds of
 drives, all without a step size, so that no error grows with time:
 
 - Bases that move in terms with closed-form solutions (`model.transients.base_motion`):
@@ -24,7 +24,7 @@ drives, all without a step size, so that no error grows with time:
   exp(-sigma period). For long envelopes the plate is solved every half hertz, with linear
   interpolation, up to where smooth envelopes have a spectrum, which is ended along a raised cosine.
 
-Not modelled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
+Not modeled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
 rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
 base jumped (ramp 0): displacement and velocity of the plate are continuous through every change.
 """
@@ -211,7 +211,7 @@ class PlateInTime:
         Also its derivative by s: a base that rises as t exp(s t) leads to (derivative + t z)
         exp(s t). No s may be an eigenvalue; imaginary ones never are if anything damps. An ERA's
         measured gain is taken at the frequency of s; its change while the base rises is not
-        modelled.
+        modeled.
         """
         bases = self._bases(s)
         forces = bases * (self.by_drive + s[:, None] * self.by_rate)
@@ -279,7 +279,7 @@ def plate_in_time(
     contacts: Sequence[FingertipLoad] = (),
     attachment_shapes: FloatArray | None = None,
 ) -> PlateInTime:
-    """Diagonalise the equations of motion of a reduced plate on its ERAs, with loads and fingers.
+    """Diagonalize the equations of motion of a reduced plate on its ERAs, with loads and fingers.
 
     contacts: fingertips that rest on it; attachment_shapes (n, r): shapes at the ERAs, loads and
     contacts, if known already. Raises InputError for ERAs that do not hold the plate (fewer than

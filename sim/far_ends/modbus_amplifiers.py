@@ -2,7 +2,7 @@
 
 ADUs are RTU with CRC, or TCP with MBAP header; a long pause ends a frame. Each message is a
 mailbox: written from register 256 n on (tag, words), its reply read from 256 n + 128 on (tag,
-result, words). Not modelled: parity and collisions on a serial line.
+result, words). Not modeled: parity and collisions on a serial line.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Motions of ERAs' bases: from the voices of a channel, with the errors of the channel.
 
 An imperfect ERA adds a second harmonic to each tone: at twice its frequency and phase, with an
-amplitude that is a complex share of the tone's. Not modelled: sums and differences of several
+amplitude that is a complex share of the tone's. Not modeled: sums and differences of several
 tones, harmonics of signals, and other distortion.
 """
 

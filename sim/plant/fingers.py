@@ -38,7 +38,7 @@ class FingerPositions:
 class FingerRecord:
     """Accelerations under one finger while it stayed at one position.
 
-    points (p, 2) [m], the centre first; weights (p,) of the points in the mean over the fingertip;
+    points (p, 2) [m], the center first; weights (p,) of the points in the mean over the fingertip;
     times (n,) [s]; accelerations (n, p) [m/s²].
     """
 

@@ -1,7 +1,7 @@
 """The plate on its ERAs under a set of contacts, reduced for forces at them and solved in time.
 
 A fingertip acts at a point, and its phalanx moves: a low-rank change and one more coordinate. The
-reduced basis is extended by the static vectors of the point, and the small system diagonalised
+reduced basis is extended by the static vectors of the point, and the small system diagonalized
 again; solutions are cached by the set of contacts. Structural damping is that of the plate on its
 ERAs.
 """

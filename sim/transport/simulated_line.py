@@ -2,7 +2,7 @@
 
 Delays come from operating systems, USB frames, latency timers and networks. Long transmissions
 arrive in pieces, each at the time of its last bit, so that an amplifier sensitive to pauses between
-bytes detects none. Not modelled: gaps between the bytes of a frame, retransmission, other devices
+bytes detects none. Not modeled: gaps between the bytes of a frame, retransmission, other devices
 on the same USB, the trigger levels of UARTs, an FTDI packet that a second reply fills up.
 """
 

@@ -86,7 +86,7 @@ function showButtons() {
 
 function showBanner() {
   const since = lostSince ? ` (since ${timeOfDay(lostSince)})` : "";
-  const warning = "Amplifiers may still be energised.";
+  const warning = "Amplifiers may still be energized.";
   let text = "";
   let reason = "";
   if (!connection?.isOpen) {
@@ -99,7 +99,7 @@ function showBanner() {
     const after = watchdog ? ` after ${watchdog}\u00a0s` : "";
     if (silences.length && !mayPlay.length) text += `Its watchdog should have silenced it${after} (not confirmed).`;
     else if (mayPlay.some(({ may_play_for_s }) => may_play_for_s === null)) text += "It can play until it is switched off.";
-    else text += `It may still be energised; its watchdog silences it${after} (not confirmed).`;
+    else text += `It may still be energized; its watchdog silences it${after} (not confirmed).`;
   } else if (daemon?.rig.simulated) {
     reason = "simulated";
     text = "Simulated amplifiers: nothing vibrates.";

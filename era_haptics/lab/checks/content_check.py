@@ -40,7 +40,7 @@ TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
 delay of the plate, one for the whole file [s]."""
 
 DEFAULT_POSITIONS = (0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6)
-"""Finger positions as fractions of the plate's length and width: the centre, often on a nodal line,
+"""Finger positions as fractions of the plate's length and width: the center, often on a nodal line,
 and four positions that no symmetry of the plate relates."""
 
 _MIN_DISTANCE = 0.04
@@ -297,7 +297,7 @@ _FAINT = 0.1  # fraction of the highest amplitude; weaker frequencies are not dr
 
 
 def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
-    """Draw level and frequency over time: the file in dashed grey, felt vibration in blue."""
+    """Draw level and frequency over time: the file in dashed gray, felt vibration in blue."""
     figure = Figure(figsize=(6.9, 4.0), layout="constrained")
     levels, tones = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     times = np.asarray(checked.step * np.arange(len(checked.expected)), dtype=float)

@@ -40,7 +40,7 @@ def play(
             metavar="FILE", help="Haptic file, or name of an effect or built-in content."
         ),
     ],
-    at: Annotated[str, typer.Option(metavar="X,Y", help="Position of the finger in metres.")],
+    at: Annotated[str, typer.Option(metavar="X,Y", help="Position of the finger in meters.")],
     level: Annotated[
         float | None,
         typer.Option(
@@ -194,7 +194,7 @@ def check(
         str | None,
         typer.Option(
             metavar="X,Y",
-            help="Position of the finger in metres. Default: the median of five positions.",
+            help="Position of the finger in meters. Default: the median of five positions.",
         ),
     ] = None,
     quiet: QuietOption = None,
@@ -225,7 +225,7 @@ def check(
     the table was built for switched drives.
 
     Without --table, the founding paper's plate is used. Without --at, five positions (including the
-    centre) are simulated and the median one is shown. Several files, or a folder with its
+    center) are simulated and the median one is shown. Several files, or a folder with its
     subfolders, are listed with one line each. Exits with status 1 if the kept share of a file's
     level is below --least, or if one of several files cannot be read. Sharpness does not change the
     exit status.

@@ -251,7 +251,7 @@ _RESTING_AWAY = 0.06  # m, minimum distance from a touch to the resting finger
 class CheckedEffect:
     """Simulated touches of an effect in a region.
 
-    on: layout key that plays the effect; promised_db_sl: None for as strong as the neighbours
+    on: layout key that plays the effect; promised_db_sl: None for as strong as the neighbors
     allow; touches: at each position alone, then with a resting finger; area [m²]: share of the
     region for each position.
     """
@@ -416,7 +416,7 @@ def _resting(plate: Plate, at: Point, number: int) -> Point:
 
 
 def _silent(target: Target, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
-    # The level that the neighbours allow can be zero.
+    # The level that the neighbors allow can be zero.
     can_be = target.level_db_sl is None
     silent = [each for each in touches if each.reason is not None and not (can_be and each.resting)]
     if silent:

@@ -93,7 +93,7 @@ def _lines(each: "CheckedEffect") -> list[str]:
     from controller.effects.effect import DEFAULT_MAX_DB_SL
 
     promised = (
-        "as neighbours allow" if each.promised_db_sl is None else f"{each.promised_db_sl:.3g} dB SL"
+        "as neighbors allow" if each.promised_db_sl is None else f"{each.promised_db_sl:.3g} dB SL"
     )
     lines = [f"{each.region}, {each.on}: {each.effect}, {promised}"]
     if each.felt:

@@ -38,7 +38,7 @@ from model.table.table import LocalizationTable
 MAX_PAIRS, MAX_TRIPLES = 150, 150
 """In layouts with many regions, only the closest pairs and triples are checked."""
 
-_POSITIONS = 4  # per region: the centre, then points farthest from it and from each other
+_POSITIONS = 4  # per region: the center, then points farthest from it and from each other
 _NAMED = 4  # pairs that are close
 _NEAREST = 0.02  # m; two fingertips next to each other
 
@@ -158,7 +158,7 @@ def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:
 
 
 def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) -> list[Point]:
-    """Return a few positions in a region: the centre, then each the farthest from those before."""
+    """Return a few positions in a region: the center, then each the farthest from those before."""
     left, found = touch_positions(layout, region, table.plate)[0], list[Point]()
     while left and len(found) < _POSITIONS:
         if found:
@@ -170,7 +170,7 @@ def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) ->
 
 
 def _nearest(groups: Iterable[tuple[Region, ...]], count: int) -> list[tuple[Region, ...]]:
-    """Return the groups of regions whose centres are closest, in the order of the layout."""
+    """Return the groups of regions whose centers are closest, in the order of the layout."""
     every = [*groups]
 
     def size(number: int) -> float:
@@ -278,7 +278,7 @@ _MAX_CONTRAST = 30.0  # dB
 _FREQUENCY_TICKS = (40, 60, 100, 150, 250, 400, 600)  # Hz
 _NO_PROMISE = "#bbbbbb"
 _MAX_JOINED = 12  # simultaneous fingers drawn connected, for each count
-_BRIGHT = 0.6  # position on a colour scale above which black text is readable
+_BRIGHT = 0.6  # position on a color scale above which black text is readable
 _SIZES = (44.0, 16.0, 5.0)  # of marks; smaller marks are a region's further effects
 
 
@@ -288,16 +288,16 @@ class _TouchPanel:
 
     title: str
     label: str
-    """Of the colour bar."""
+    """Of the color bar."""
     value: Callable[[CheckedEffect, SimulatedTouch], float | None]
-    """Value shown by a mark's colour; None without a value."""
+    """Value shown by a mark's color; None without a value."""
     norm: Normalize
     colors: str
     marker: Callable[[float], str] = lambda _: "o"
     """Shape of a value's mark."""
 
     def color(self, value: float) -> tuple[float, float, float, float]:
-        """Return the colour of a value on the panel's scale."""
+        """Return the color of a value on the panel's scale."""
         return colormaps[self.colors](self.norm(value))
 
 
@@ -362,7 +362,7 @@ def check_figure(
     else:
         subplots[-1].set_axis_off()
     figure.supxlabel(
-        "Crosses: nothing is felt. Grey marks: no promise. Small marks: a region's other effects. "
+        "Crosses: nothing is felt. Gray marks: no promise. Small marks: a region's other effects. "
         "Squares at the edges: ERAs.",
         fontsize=SMALL_TEXT,
         wrap=True,
@@ -424,7 +424,7 @@ def _draw_together(
     axes.set_yticks(range(len(names)), names, fontsize=SMALL_TEXT)
     axes.set_title("pairs below the diagonal, triples above", fontsize=TITLE_TEXT)
     bar = figure.colorbar(ScalarMappable(norm, colors), ax=axes, shrink=0.85)
-    label = "promised contrast of the worst finger / dB\n(also colours the lines)"
+    label = "promised contrast of the worst finger / dB\n(also colors the lines)"
     bar.set_label(label, fontsize=SMALL_TEXT)
     bar.ax.tick_params(labelsize=SMALL_TEXT)
 

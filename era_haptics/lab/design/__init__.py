@@ -1,1 +1,1 @@
-"""Optimise the positions of actuators for the best promised contrast."""
+"""Optimize the positions of actuators for the best promised contrast."""

@@ -1,4 +1,4 @@
-"""`era design`: optimise or rank ERA positions by promised felt contrast."""
+"""`era design`: optimize or rank ERA positions by promised felt contrast."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -99,7 +99,7 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Optimise or rank ERA positions by promised felt contrast.
+    """Optimize or rank ERA positions by promised felt contrast.
 
     Ctrl-C prints the layouts found so far and writes them to a file for --layouts.
     """

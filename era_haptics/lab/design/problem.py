@@ -175,7 +175,7 @@ def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
     if len(places) == 0:
         raise InputError(
             "where must leave room for ERAs on the plate, got none; check that its polygons are on "
-            "the plate, in metres from its corner"
+            "the plate, in meters from its corner"
         )
     return places, spacing
 
@@ -394,7 +394,7 @@ def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
     """Return how far ERAs are from supporting a rig's plate, 0 if they do.
 
     lowest [Hz]: minimum rigid-body frequency. The plate's weight must not pull any mount upwards,
-    so that the centre of mass is within them and the plate does not tip.
+    so that the center of mass is within them and the plate does not tip.
     """
     frequency = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
     if frequency < 1e-3:

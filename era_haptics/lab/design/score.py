@@ -1,4 +1,4 @@
-"""Fast score of layouts, and a search for ERA positions that maximises it.
+"""Fast score of layouts, and a search for ERA positions that maximizes it.
 
 The score is the expected contrast over sampled contact sets, computed like answers
 (`model.ensemble.expected_power`, `model.drive_modes`), at a few frequencies, from the receptances
@@ -52,7 +52,7 @@ _LEVEL_RESERVE = 1.2
 """Factor on the wanted level, as 90 % of plates need more than the nominal plate."""
 
 BEST_FREQUENCIES = 3
-"""Frequencies of each set at which the maximum over the quiet fingers is minimised."""
+"""Frequencies of each set at which the maximum over the quiet fingers is minimized."""
 
 _LAWSON_STEPS = 2
 
@@ -121,7 +121,7 @@ class Scorer:
             centres, length=rig.plate.length, width=rig.plate.width, rule=FIVE_POINTS
         )
         self._points = points.reshape(-1, 2)
-        self._weights: Float32Array = weights.astype(np.float32)  # (m, p), the centre first
+        self._weights: Float32Array = weights.astype(np.float32)  # (m, p), the center first
         self._cells = np.empty((0, 2))
         if uncertainty.field > 0:
             self._cells = Grid(12, 9).centres(rig.plate)
@@ -132,7 +132,7 @@ class Scorer:
             numbers.ravel()[first[np.equal(sizes, size)][:, None] + np.arange(size)]
             for size in np.unique(sizes).tolist()
         )
-        # From a fingertip's centre to its points, (v, f, m, p).
+        # From a fingertip's center to its points, (v, f, m, p).
         every, tips = np.arange(len(centres)), self._solved(centres).to_tips
         tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
         self._own = np.moveaxis(tips[:, :, every, :, every], 0, 2)
@@ -384,7 +384,7 @@ class LayoutSearch:
         return [ScoredLayout(each, self._score_at(places, each)) for each in layouts]
 
     def sensitivities(self, positions: FloatArray, *, step: float) -> FloatArray:
-        """Return the largest change of the score [dB] per metre for a step [m] of each ERA,
+        """Return the largest change of the score [dB] per meter for a step [m] of each ERA,
         (n,)."""
         (own,) = self.scored([positions])
         changes = np.zeros(len(positions))

@@ -152,7 +152,7 @@ def measure(
 ) -> MeasuredResponses:
     """Play all runs of a multisine and estimate the responses.
 
-    periods: analysed periods per run. progress: called with the number of runs done and the total.
+    periods: analyzed periods per run. progress: called with the number of runs done and the total.
     is_heard: whether every ERA was detected before, at another position of a moved sensor. Raises
     InputError or LinkError for inputs that are clipped, silent, swapped or incoherent, and for
     blocks lost three times in a row.
@@ -261,7 +261,7 @@ def measure_plate(
 ) -> MeasuredPlate:
     """Measure through a sound card, which plays and records.
 
-    level, frequencies, seed: see `open_desk`; periods: analysed periods per run. Raises InputError,
+    level, frequencies, seed: see `open_desk`; periods: analyzed periods per run. Raises InputError,
     LinkError, like `era measure`.
     """
     desk = Desk(rig, read_sensors(sensors_file, rig.plate))

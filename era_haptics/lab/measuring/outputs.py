@@ -3,7 +3,7 @@
 Either a person feels or sees a soft tone, or an accelerometer is placed next to each actuator in
 turn. The latter also works for a poorly known plate: an actuator moves its own position more than
 the others do, and the velocity there determines the power it gives to the plate. Responses at all
-positions are compared with the rig's model, normalised per frequency. The unknown delay of the
+positions are compared with the rig's model, normalized per frequency. The unknown delay of the
 sound card is fitted jointly for all outputs. Polarities are relative to the majority.
 """
 

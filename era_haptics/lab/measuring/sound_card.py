@@ -361,7 +361,7 @@ _LEFT = 0.01  # of a free vibration
 
 
 def converters(response: ComplexArray) -> ComplexArray:
-    """Complex loop-back response (f,), normalised to a median modulus of 1.
+    """Complex loop-back response (f,), normalized to a median modulus of 1.
 
     Dividing by the loop-back removes the delay, including fractions of a sample, and the shape of
     filters. Gains remain, since levels and sensitivities are stated separately.
@@ -615,7 +615,7 @@ class Run:
 
 
 def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
-    """Duration of a run [s] with `periods` analysed periods after settling."""
+    """Duration of a run [s] with `periods` analyzed periods after settling."""
     return settling + PERIOD * periods + _TAIL
 
 

@@ -169,22 +169,22 @@ FREE_FAULTS: dict[str, tuple[Callable[[Modes], Modes], float | None, str]] = {
     "maximum-of-1": (
         lambda free: _scaled(free, _largest(free)),
         None,
-        "got shapes that look normalised to their largest value",
+        "got shapes that look normalized to their largest value",
     ),
     "maximum-of-1-elsewhere": (
         lambda free: _without_point(_scaled(free, _largest(free))),
         None,
-        "got shapes that look normalised to their largest value",
+        "got shapes that look normalized to their largest value",
     ),
     "unit-length": (
         lambda free: _scaled(free, np.linalg.norm(free["shapes"], axis=1)),
         MASS,
-        "got shapes that look normalised to unit length",
+        "got shapes that look normalized to unit length",
     ),
     "one-node": (
         lambda free: _scaled(free, free["shapes"][:, 0]),
         MASS,
-        "got shapes that look normalised to one node",
+        "got shapes that look normalized to one node",
     ),
     "root-of-the-frequency": (
         lambda free: _scaled(free, np.sqrt(4 * math.pi * np.maximum(free["frequencies"], 1.0))),
@@ -229,12 +229,12 @@ FREE_FAULTS: dict[str, tuple[Callable[[Modes], Modes], float | None, str]] = {
     "millimetres": (
         lambda free: free | {"nodes": 1000 * free["nodes"]},
         None,
-        r"sides must be in metres, got 400 x 300 m \(0\.4 x 0\.3 m if they are in mm\)",
+        r"sides must be in meters, got 400 x 300 m \(0\.4 x 0\.3 m if they are in mm\)",
     ),
     "kilometres": (
         lambda free: free | {"nodes": free["nodes"] / 1000},
         None,
-        r"sides must be in metres, got 0\.0004 x 0\.0003 m; convert",
+        r"sides must be in meters, got 0\.0004 x 0\.0003 m; convert",
     ),
     "two-rows": (
         lambda free: {
@@ -262,8 +262,8 @@ def test_impossible_modes_of_a_free_panel_are_rejected(
 @pytest.mark.parametrize(
     ("sizes", "message"),
     [
-        (_largest, "normalised to their largest value"),
-        (lambda modes: np.linalg.norm(modes["shapes"], axis=1), "normalised to unit length"),
+        (_largest, "normalized to their largest value"),
+        (lambda modes: np.linalg.norm(modes["shapes"], axis=1), "normalized to unit length"),
         (lambda modes: 1000**0.5, "integral of shape² over 0.9 kg is 0.0009"),
     ],
     ids=["maximum-of-1", "unit-length", "grams"],

@@ -8,7 +8,8 @@ package, texts (help, errors, log messages, descriptions) and docs (docstrings a
 one each. `english.toml` has the budgets, exceptions with a reason, and allowed phrases: list a
 phrase there if it is correct. A short file may have one pattern.
 
-The patterns indicate a foreign sentence; rewrite the sentence, not the pattern.
+The patterns indicate a foreign sentence; rewrite the sentence, not the pattern. Pages, YAML files
+and texts have American spelling, without exception; keys in backticks keep theirs.
 """
 
 import ast
@@ -107,6 +108,20 @@ PATTERNS = {
 }
 
 
+BRITISH = re.compile(
+    r"\b(?:un|re)?(?:"
+    r"analys(?:e|ed|ing)|artefacts?|behaviours?|catalogue[ds]?|centr(?:e|ed|es)"
+    r"|colou(?:r|red|ring|rs)|favour\w*|grey\w*|honour\w*|label(?:led|ling)|licences?"
+    r"|(?:centi|kilo|milli)?metres?|modell(?:ed|ing)|neighbour\w*|towards"
+    r"|(?:discret|energ|factor|initial|linear|maxim|minim|normal|optim|organ|quant|real|recogn"
+    r"|summar|synchron)is(?:e|ed|er|ers|es|ing|ation|ations)"
+    r")\b",
+    re.IGNORECASE,
+)
+"""British spellings of common words."""
+
+BRITISH_SPELLING = "British spelling"
+
 NAMES = tuple(PATTERNS)
 ALTERNATIVES = "|".join(f"({pattern.words})" for pattern in PATTERNS.values())
 ANY = re.compile(rf"(?:\b|(?=,))(?:{ALTERNATIVES})\b".replace(" ", r"\s+"), re.IGNORECASE)
@@ -122,7 +137,9 @@ class Finding(NamedTuple):
     sentence: str
 
     def __str__(self) -> str:
-        suggestion = PATTERNS[self.pattern].suggestion
+        suggestion = "the American spelling"
+        if self.pattern != BRITISH_SPELLING:
+            suggestion = PATTERNS[self.pattern].suggestion
         return f"{self.file}:{self.line}: {self.pattern}: {self.sentence!r}; write {suggestion}"
 
 
@@ -132,6 +149,7 @@ class Prose:
 
     words: int = 0
     findings: list[Finding] = field(default_factory=list)
+    british: list[Finding] = field(default_factory=list)
 
     @property
     def rate(self) -> float:
@@ -148,10 +166,17 @@ class Prose:
         for phrase in allowed:
             text = text.replace(phrase, "")
         for match in ANY.finditer(text):
-            line = text.count("\n", 0, match.start()) + 1
             assert match.lastindex is not None
             name = NAMES[match.lastindex - 1]
-            self.findings.append(Finding(file, line, name, sentence_at(text, match.start())))
+            self.findings.append(finding_at(file, name, text, match.start()))
+        for match in BRITISH.finditer(text):
+            self.british.append(finding_at(file, BRITISH_SPELLING, text, match.start()))
+
+
+def finding_at(file: str, pattern: str, text: str, position: int) -> Finding:
+    """Return the finding of a pattern at a position of a file's prose."""
+    line = text.count("\n", 0, position) + 1
+    return Finding(file, line, pattern, sentence_at(text, position))
 
 
 WORD = re.compile(r"[^\W\d_][^\s\0]*")
@@ -184,12 +209,14 @@ def prose_of_page(text: str) -> str:
     return NO_PROSE.sub(lambda match: blank(match[0]), text)
 
 
+QUOTED = re.compile(r"`[^`\n]*`")
 COMMENT = re.compile(r"(?:^|(?<=\s))#[^\n]*", re.MULTILINE)
 
 
 def prose_of_yaml(text: str) -> str:
     """Return the comments of a YAML file, with everything else blanked."""
-    return keep(text, [match.span() for match in COMMENT.finditer(text)])
+    comments = keep(text, [match.span() for match in COMMENT.finditer(text)])
+    return QUOTED.sub(lambda match: blank(match[0]), comments)
 
 
 def keep(text: str, spans: Iterable[tuple[int, int]]) -> str:
@@ -295,6 +322,8 @@ def over_budget(prose: dict[str, Prose], settings: dict[str, Any]) -> Iterator[s
         if not part.is_within(budget):
             yield f"{name}: {part.rate:.1f} patterns per 1000 words, at most {budget} are allowed:"
             yield from map(str, part.findings)
+        if not name.endswith(": docs"):
+            yield from map(str, part.british)
 
 
 def main(arguments: list[str]) -> str:

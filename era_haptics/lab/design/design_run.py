@@ -161,7 +161,7 @@ def _expect_numbers(apart: float, lowest: float, stiffness: Sequence[float]) -> 
     expect_number(apart, what="apart", unit="metres")
     expect_number(lowest, what="lowest", unit="hertz")
     for value in stiffness:
-        expect_number(value, what="stiffness", unit="newtons per metre")
+        expect_number(value, what="stiffness", unit="newtons per meter")
     expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
 
 

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 from controller.play.intent import IntentSource
 from controller.play.loop import Cycle
 from controller.play.planner import Planner
-from controller.play.routing import limits_of, playback_capabilities
+from controller.play.shared_capabilities import limits_of, playback_capabilities
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group

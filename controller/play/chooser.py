@@ -27,7 +27,7 @@ from controller.play.joint_answers import (
     answered,
     selection_of,
 )
-from controller.play.routing import PlaybackCapabilities
+from controller.play.shared_capabilities import PlaybackCapabilities
 from model.answer.answer import APART_HZ, Answer
 from model.answer.answer_levels import scaled
 from model.arrays import NEARLY

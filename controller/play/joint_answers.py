@@ -37,7 +37,7 @@ from controller.play.intent import (
     not_served,
     own_level_db_sl,
 )
-from controller.play.routing import PlaybackCapabilities
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import (
     HELD_BACK,

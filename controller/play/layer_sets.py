@@ -19,12 +19,12 @@ from controller.play.routing import (
     PLAIN_STEP,
     Drive,
     PlateLayer,
-    PlaybackCapabilities,
     piece_of,
     restarted_by,
     route,
     thinned,
 )
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slot import CROSSFADE, MIN_LEFT, MIN_VALID_FOR, Slot
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.playing import AmplifierLayer

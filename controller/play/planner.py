@@ -15,10 +15,11 @@ from functools import partial
 
 from controller.play.changes import ChangeTimes, WaitingChanges
 from controller.play.chooser import Chooser
+from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import IntentSource, Pulse, Selection, no_layer_free
 from controller.play.layer_sets import Sets
-from controller.play.routing import CountedClocks, PlaybackCapabilities
 from controller.play.selection import Selector
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slot import Slot
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Slots
 from controller.sources.contact_tracker import ContactTracker
@@ -239,7 +240,7 @@ class Planner:
         """Count the clocks; while fingers wait for a plan, at most every other heartbeat."""
         if now >= self._clocks_due or not self._tracker.changed:
             self._clocks_due = now + _CLOCKS_INTERVAL
-            self._count_clocks(self.clocks.known)
+            self._count_clocks(self.clocks.present_errors)
 
     def _is_due(self, now: float) -> bool:
         """Whether fingers have changed, or the time for a new plan [s] has come."""

@@ -33,7 +33,7 @@ from controller.play.intent import (
     not_served,
 )
 from controller.play.joint_answers import STRETCH
-from controller.play.routing import PlaybackCapabilities
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slot import CROSSFADE, FALL_AFTER
 from controller.sources.touch import Contact, ContactKey
 from model.answer.plan import MAX_SEPARATE

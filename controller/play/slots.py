@@ -17,10 +17,10 @@ from controller.play.layer_sets import SetBuilder, Sets
 from controller.play.routing import (
     HELD,
     PlateLayer,
-    PlaybackCapabilities,
     full_drive,
     tones_by_era,
 )
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slot import Slot, SlotPhase, settling_time
 from controller.sources.touch import ContactKey
 from drivers.errors import CommandRefused

@@ -9,9 +9,16 @@ from drivers.host.bounds import COMMIT_DELAY
 from drivers.host.identification import AmplifierIdentification
 from drivers.host.ledger import Ledger, StagedSet
 from drivers.playing import AmplifierLayer
-from drivers.protocol.definition import ATTEMPTS, COMMAND, ENVELOPE, KNOT, LAYER
+from drivers.protocol.definition import ATTEMPTS, LAYER
 from drivers.protocol.records import Values
-from drivers.protocol.sets import PART_WORDS, LayerSet, is_vibrating, pack_layers, parts
+from drivers.protocol.sets import (
+    PART_WORDS,
+    LayerSet,
+    command_words,
+    is_vibrating,
+    pack_layers,
+    parts,
+)
 
 _CHECKED_FOR = 0.005  # s; a check holds for so long unless anything is sent or received
 IsPreempted: TypeAlias = Callable[[], bool]
@@ -154,9 +161,7 @@ def _word_count(layers: Sequence[AmplifierLayer]) -> int:
     """Return how many words layers have on the wire."""
     words = LAYER.words * len(layers)
     for layer in layers:
-        words += COMMAND.words * len(layer.tones)
         for tone in layer.tones:
-            for envelope in (tone.onset, tone.ending):
-                if envelope is not None:
-                    words += ENVELOPE.words + KNOT.words * len(envelope.knots)
+            envelopes = (tone.onset, tone.ending)
+            words += command_words([len(shape.knots) for shape in envelopes if shape is not None])
     return words

@@ -54,6 +54,14 @@ _WIDEST: Values = {
 """Capabilities of an amplifier limited only by the table, for sets."""
 
 
+def command_words(knot_counts: Iterable[int] = ()) -> int:
+    """Return how many words a command has with envelopes of these numbers of knots."""
+    words = COMMAND.words
+    for count in knot_counts:
+        words += ENVELOPE.words + KNOT.words * count
+    return words
+
+
 def token_after(number: int) -> int:
     """Return the token or latch after this one, 0 before the first: 1..65535, then 1 again."""
     return number % _LAST_TOKEN + 1

@@ -13,7 +13,7 @@ from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
 from controller.play.chooser import Chooser
 from controller.play.intent import FingerTarget, Question, Target, band_problem
 from controller.play.joint_answers import answered
-from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import exposures

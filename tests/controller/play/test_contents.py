@@ -32,8 +32,8 @@ from controller.play.intent import (
     Selection,
     Target,
 )
-from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Selector
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slot import Slot, SlotPhase
 from controller.play.slots import Slots
 from controller.sources.touch import Contact, ContactKey

@@ -38,8 +38,8 @@ from controller.play.intent import (
     weakened,
 )
 from controller.play.reports import PlayReport
-from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Selector
+from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Change, Contact, ContactKey, Touch, TouchFrame
 from drivers.host.group_states import GroupState

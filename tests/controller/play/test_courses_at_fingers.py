@@ -20,7 +20,7 @@ from controller.effects.file_effect import File
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from kit.clock import in_virtual_time
 from kit.fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on

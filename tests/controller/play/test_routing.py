@@ -17,15 +17,13 @@ import numpy as np
 import pytest
 
 from controller.effects.player import EffectPlayer
+from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import leaks_db_sl
-from controller.play.routing import (
-    CountedClocks,
+from controller.play.routing import on_wire, route, thinned
+from controller.play.shared_capabilities import (
     EnvelopeSupport,
     envelope_support,
-    on_wire,
     playback_capabilities,
-    route,
-    thinned,
 )
 from controller.sources.touch import Contact, ContactKey
 from drivers.host.group import Group
@@ -99,7 +97,7 @@ def test_clocks_that_come_and_go_are_told_once_with_how_often(
     seconds, now = [0.0], {"a": 4e-6, "b": 4e-6}
     monkeypatch.setattr(threads, "now", lambda: seconds[0])
     clocks, table = CountedClocks(HALVES, lambda: now), smooth_table()
-    with caplog.at_level(logging.INFO, logger="controller.play.routing"):
+    with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
         table = clocks.counted_by(table)
         for _ in range(5):
             for now["b"], groups in ((math.inf, (0, 1, 0, 1)), (4e-6, ())):
@@ -125,7 +123,7 @@ def test_clocks_that_come_and_go_are_told_once_with_how_often(
 def test_clock_that_is_not_known_yet_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
     """When its line has just been opened."""
     clocks = CountedClocks(HALVES, lambda: {"a": 4e-6, "b": math.inf})
-    with caplog.at_level(logging.INFO, logger="controller.play.routing"):
+    with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
         assert clocks.counted_by(smooth_table()).clocks.groups == (0, 1, 0, 1)
     assert [each.levelno for each in caplog.records] == [logging.INFO]
 

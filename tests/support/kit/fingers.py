@@ -42,7 +42,7 @@ from controller.play.intent import (
 from controller.play.joint_answers import answered, selection_of
 from controller.play.layer_sets import Sets
 from controller.play.reports import PlayReport
-from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.slots import Slots
 from controller.sources.touch import Contact, Touch, TouchFrame
 from controller.sources.tuio_capture import RecordedDatagram
@@ -650,7 +650,7 @@ class Pressed:
         """
         with pytest.MonkeyPatch.context() as patched:
             if not self.is_shaped:
-                plain = "controller.play.routing.envelope_support"
+                plain = "controller.play.shared_capabilities.envelope_support"
                 patched.setattr(plain, lambda rig, amplifiers: RAMPS_ONLY)
             return run_virtual(self._run(ways, held))
 

@@ -85,7 +85,7 @@ class StatusContradictions:
                 problem = None
         if problem is None:
             # The reply to a request that feeds does not show how the watchdog runs down.
-            self._note_agreement(shows_watchdog=not is_fed and feeding.tells(sent_at))
+            self._note_agreement(shows_watchdog=not is_fed and feeding.is_shown_by(sent_at))
         elif self._is_fault(now, is_fed=is_fed):
             raise contradicted(self._name, problem)
 

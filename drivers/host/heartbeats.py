@@ -103,7 +103,7 @@ class Heartbeats:
             if is_shared and not amplifier.committed:
                 token = token or self._first_token(line_amplifiers)
                 feed = partial(amplifier.stage, token, (), now=True, priority=Priority.HEARTBEAT)
-            elif may_read and now >= due and amplifier.feeding.tells(now):
+            elif may_read and now >= due and amplifier.feeding.is_shown_by(now):
                 interval = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
                 self._running_due[amplifier] = now + max(interval, _STATUS_INTERVAL)
                 statuses_time = 2 * amplifier.exchange_time("GetStatus") * len(line.members)
@@ -160,7 +160,7 @@ class Heartbeats:
         limit = HEARTBEAT
         if line.late <= GRACE:
             limit = _UNFED + sum([amplifier.exchange_time("Set") for amplifier in line_amplifiers])
-        if line.time() - min([amplifier.feeding.since for amplifier in line_amplifiers]) <= limit:
+        if line.time() - min([amplifier.feeding.fed_at for amplifier in line_amplifiers]) <= limit:
             return None
         session = line_amplifiers[0].session
         token = 0

@@ -179,7 +179,7 @@ async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException
 
 def last_fed_at(amplifier: Amplifier) -> float:
     """Return when an amplifier's watchdog was last surely fed [s]."""
-    return amplifier.feeding.since
+    return amplifier.feeding.fed_at
 
 
 def is_lost(amplifier: Amplifier) -> bool:

@@ -25,24 +25,24 @@ class Feeding:
     """Whether an adapter on the wire may keep requests and deliver them later."""
     watchdog: float = 0.0
     """Time of the watchdog."""
-    may: float = -math.inf
+    maybe_fed_at: float = -math.inf
     """When the last request that may have fed the watchdog went out."""
-    plays: float = -math.inf
+    kept_playing_at: float = -math.inf
     """When the last such request went out that does not also silence the amplifier."""
-    arrives: float = -math.inf
+    arrives_at: float = -math.inf
     """When that request arrives, unless it is delayed."""
     fade: float = 0.0
     """Longest ramp of a stop, a disarm or an unanswered silence since then."""
-    since: float = -math.inf
+    fed_at: float = -math.inf
     """When the last request that surely fed the watchdog went out."""
     confirmed_at: float = -math.inf
     """When the reply to that request came."""
 
     def note_sent(self, now: float, arrives: float) -> None:
         """Note a request that feeds the watchdog and lets playback continue, sent now."""
-        self.may = now
-        self.plays = now
-        self.arrives = arrives
+        self.maybe_fed_at = now
+        self.kept_playing_at = now
+        self.arrives_at = arrives
         self.fade = 0.0
 
     def note_repeated_silence(self, now: float, ramp: float) -> None:
@@ -51,7 +51,7 @@ class Feeding:
         It does not put off when the amplifier must be silent: if it arrives, it does so within the
         time of the watchdog, and its ramp follows.
         """
-        self.may = now
+        self.maybe_fed_at = now
         self.note_ramp(ramp)
 
     def note_ramp(self, ramp: float) -> None:
@@ -60,10 +60,10 @@ class Feeding:
 
     def note_reply(self, sent_at: float, now: float) -> None:
         """Note a reply, received now, to a request that has surely fed the watchdog."""
-        self.since = sent_at
+        self.fed_at = sent_at
         self.confirmed_at = now
-        if sent_at > self.plays:
-            self.plays = sent_at
+        if sent_at > self.kept_playing_at:
+            self.kept_playing_at = sent_at
             self.fade = 0.0
 
     @property
@@ -73,8 +73,8 @@ class Feeding:
         A request without reply may still be under way. A request with a reply arrived before that
         reply, but possibly later than the line takes, because a busy machine may have delayed it.
         """
-        is_confirmed = self.plays <= self.since
-        arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
+        is_confirmed = self.kept_playing_at <= self.fed_at
+        arrival = self.confirmed_at if is_confirmed else self.arrives_at + self.delay
         return arrival + self.watchdog + self.fade + SILENCING_TIME
 
     @property
@@ -85,12 +85,12 @@ class Feeding:
         have no effect. Of several attempts without reply, one may have arrived and the next one may
         be buffered.
         """
-        may_be_fed_again = self.is_kept and self.plays > self.since
+        may_be_fed_again = self.is_kept and self.kept_playing_at > self.fed_at
         return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
 
-    def tells(self, sent_at: float) -> bool:
+    def is_shown_by(self, sent_at: float) -> bool:
         """Whether a status requested at a time [s] shows if the watchdog is running down."""
-        return self.may <= self.since and sent_at - self.confirmed_at > REACTION
+        return self.maybe_fed_at <= self.fed_at and sent_at - self.confirmed_at > REACTION
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible remaining watchdog time [s] in a status; None if it is possible.
@@ -98,10 +98,10 @@ class Feeding:
         sent_at: when the request for the status went out, which does not feed; now: when the status
         came.
         """
-        lowest = self.watchdog - (now - self.since) - REACTION
+        lowest = self.watchdog - (now - self.fed_at) - REACTION
         # An unconfirmed request that may have fed may have arrived just before this one.
-        fed_at = self.confirmed_at if self.may <= self.since else sent_at
-        highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
+        last_fed_at = self.confirmed_at if self.maybe_fed_at <= self.fed_at else sent_at
+        highest = min(self.watchdog, self.watchdog - (sent_at - last_fed_at)) + REACTION
         if lowest <= left <= highest:
             return None
         return f"watchdog left must be {max(lowest, 0):.3f} to {highest:.3f} s, got {left:.3f} s"

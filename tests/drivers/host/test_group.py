@@ -540,7 +540,7 @@ def test_only_wires_use_encoders() -> None:
     wires = {file for file in users if WIRES in file.parents}
     assert {file.name for file in wires} == {"can_bus.py", "serial_frames.py", "serial_line.py"}
     above = [file for file in users - wires if "protocol" not in file.parts]
-    assert above == [HOST / "amplifier.py"]
+    assert above == [HOST / "set_admission.py"]
 
 
 def test_only_what_a_ledger_admits_is_packed() -> None:
@@ -553,7 +553,7 @@ def test_only_what_a_ledger_admits_is_packed() -> None:
     )
     admitted = [
         ast.unparse(node.targets[0])
-        for node in nodes(HOST / "amplifier.py")
-        if isinstance(node, ast.Assign) and ".ledger.admit(" in ast.unparse(node.value)
+        for node in nodes(HOST / "set_admission.py")
+        if isinstance(node, ast.Assign) and "ledger.admit(" in ast.unparse(node.value)
     ]
     assert admitted == [packed]

@@ -12,6 +12,7 @@
     └── CommandError (ValueError)         an invalid request; the caller's fault
 
 Backends translate exceptions of their libraries into these and keep the cause.
+`host/group_states.py` lists how a group of amplifiers reacts to each.
 """
 
 import re

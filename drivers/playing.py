@@ -32,6 +32,14 @@ _PER_FULL = QUANTITIES["level"].per_unit
 _PER_DEGREE = QUANTITIES["phase"].per_unit
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
 _SILENCE = Command(channel=0, frequency=0, level=0, phase=0)
+_PER_RAMP = QUANTITIES["ramp"].per_unit
+_PER_VALID_FOR = QUANTITIES["valid_for"].per_unit
+_LEVEL = QUANTITIES["level"]
+_PHASE = QUANTITIES["phase"]
+_FREQUENCY = QUANTITIES["frequency"]
+_SLEW = QUANTITIES["slew"]
+LAYERS_MAX = QUANTITIES["layer_count"].maximum
+"""Largest number of layers of an amplifier."""
 SAME = 1e-6
 """Ends of fades that are closer than this count as equal, so that rounding decides nothing [s]."""
 
@@ -334,12 +342,13 @@ class AmplifierLayer:
     """Whether the layer, named without tones, goes on for another `valid_for`."""
 
 
-LAYERS_MAX = QUANTITIES["layer_count"].maximum
-"""Largest number of layers of an amplifier."""
-_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
-_FREQUENCY, _SLEW = QUANTITIES["frequency"], QUANTITIES["slew"]
-_PER_RAMP = QUANTITIES["ramp"].per_unit
-_PER_VALID_FOR = QUANTITIES["valid_for"].per_unit
+class _WaitingLayer(NamedTuple):
+    """A committed set of a layer that starts once the layer's onsets have ended."""
+
+    starts_at: float
+    """In s."""
+    layer_set: LayerSet
+    token: int
 
 
 @dataclass
@@ -350,7 +359,7 @@ class _Layer:
     ramp: int = 0  # in units of the wire
     valid_for: int = 0  # in units of the wire
     ends: float = math.inf  # s; by `valid_for`
-    waiting: tuple[float, LayerSet, int] | None = None  # when a set starts [s], and its token
+    waiting: _WaitingLayer | None = None
 
 
 @dataclass
@@ -405,7 +414,7 @@ class Playback:
                 layer.ends = _end_of(layer_set, time) + self.uncertainty
                 continue
             start = self.onsets_end(layer_set.layer, time) if layer_set.after else time
-            layer.waiting = (start, layer_set, token) if start > time else None
+            layer.waiting = _WaitingLayer(start, layer_set, token) if start > time else None
             if start <= time:
                 self._start(layer_set, token, time)
         self._note_changes()
@@ -434,10 +443,10 @@ class Playback:
         # Voices that faded earlier are dropped. A voice that fades right now is kept, because a set
         # that waited for its end can continue it.
         self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf), number)
-        if layer.waiting is not None and layer.waiting[0] <= at:
-            _, layer_set, token = layer.waiting
+        waiting = layer.waiting
+        if waiting is not None and waiting.starts_at <= at:
             layer.waiting = None
-            self._start(layer_set, token, at)
+            self._start(waiting.layer_set, waiting.token, at)
         else:
             self._end(number, at)
         self._note_changes()
@@ -461,8 +470,8 @@ class Playback:
         for layer in self._layers.values():
             first = min(first, layer.ends)
             if layer.waiting is not None:
-                first = min(first, layer.waiting[0])
-                waiting.append(layer.waiting[1])
+                first = min(first, layer.waiting.starts_at)
+                waiting.append(layer.waiting.layer_set)
         self.next_due = first
         self.waiting = waiting
         tokens = {}
@@ -547,8 +556,7 @@ class Playback:
         tokens = {0, self.tokens.get(layer, 0)}
         state = self._layers.get(layer)
         if state is not None and state.waiting is not None:
-            _, _, waiting_token = state.waiting
-            tokens.add(waiting_token)
+            tokens.add(state.waiting.token)
         return tokens
 
     def unsure(self, by: float, half: Sequence[float] = (0.0,) * LAYERS_MAX) -> set[int]:
@@ -617,7 +625,9 @@ class Playback:
         """Time [s] when each layer next ends or starts its waiting set, and its number."""
         dues = []
         for number, layer in self._layers.items():
-            due = layer.ends if layer.waiting is None else min(layer.ends, layer.waiting[0])
+            due = layer.ends
+            if layer.waiting is not None:
+                due = min(due, layer.waiting.starts_at)
             if due < math.inf:
                 dues.append((due, number))
         return dues

@@ -50,7 +50,7 @@ class FrameError(DriverError):
 
 
 class CommandRefused(DriverError):
-    """The guard or the amplifier rejected a request; no part of it was applied.
+    """The guard or the amplifier rejected a request; nothing was applied.
 
     channel: the channel at fault, if any; until: time [s] from which the same request is allowed,
     if only its time is wrong. may_play: whether it may have been carried out nevertheless, since an

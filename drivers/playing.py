@@ -2,7 +2,7 @@
 
 The host states `AmplifierLayer`s in physical units; the ledger (`drivers.host.ledger`) checks them
 and rounds them to the integers of the wire. `Playback` depends only on these sets and their
-commits. A channel plays the sum of its voices. A voice is one tone of one layer until it has faded:
+commits. A channel plays the sum of its voices. A voice is a tone of a layer until it has faded:
 
     Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its transition, in full levels
 
@@ -72,7 +72,7 @@ def peak_of(envelope: Envelope | None) -> float:
 class VoiceTransition:
     """Transition of a voice from one complex amplitude to another.
 
-    Follows straight lines through its knots or, without knots, a raised cosine of one step.
+    Follows straight lines through its knots or, without knots, a raised cosine over a step.
     """
 
     start: float
@@ -115,7 +115,7 @@ class VoiceTransition:
     def points(self, since: float, until: float = math.inf) -> tuple[complex, ...]:
         """Return the amplitudes at two times [s] and at the knots between them.
 
-        All other amplitudes between these times are between two of them.
+        All other amplitudes between these times are between two listed ones.
         """
         between = []
         for number, knot in enumerate(self.knots, 1):

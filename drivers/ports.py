@@ -65,7 +65,7 @@ Raises LinkError.
 """
 
 PORT_OPENER: ContextVar[PortOpener | None] = ContextVar("PORT_OPENER", default=None)
-"""Opener of serial ports in this context; None: those of the machine."""
+"""Opener of serial ports in this context; None: the machine's ports."""
 
 FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError)
 """Errors of a lost device; pyserial raises TypeError if closed during a read."""
@@ -362,7 +362,7 @@ def open_device(place: Endpoint) -> serial.Serial:
         exclusive=True,
     )
     try:
-        # USB adapters delay bytes by 16 ms unless low latency is set; most of them support it.
+        # USB adapters delay bytes by 16 ms unless low latency is set, which most support.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)
         # DTR stays set when the port is closed, so that a board reset by DTR restarts only when

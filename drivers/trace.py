@@ -41,7 +41,7 @@ is_active = _writers.__len__
 
 
 def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:
-    """Trace one frame of a wire, named by its URL or port.
+    """Trace a frame of a wire; its name is a URL or port.
 
     decode: returns the meaning; called later in the writing thread, so its arguments must not
     change. Costs a comparison while nothing is traced.

@@ -150,7 +150,7 @@ class AmplifierUrl:
         self.require(kind in CLOCK_ERRORS, f"line must be one of {kinds}, got {kind!r}")
 
     def _check_options(self, names: Collection[str]) -> None:
-        """Raise CommandError for an option without one of these names."""
+        """Raise CommandError for an option with another name."""
         unknown = sorted(self.options.keys() - set(names))
         self.require(
             not unknown, f"option {', '.join(unknown)} is unknown; known: {', '.join(names)}"

@@ -1,4 +1,4 @@
-"""Connect to one amplifier by its URL, and keep it alive."""
+"""Connect to the amplifier at a URL, and keep it alive."""
 
 import asyncio
 import random

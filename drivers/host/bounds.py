@@ -1,4 +1,4 @@
-"""Limits of one amplifier, and the worst case of a set relative to these limits.
+"""Limits of an amplifier, and the worst case of a set relative to these limits.
 
 `wire_limits` combines the limits of the rig, the amplifier, its channels and this module to the
 lowest of each. `Rounding` converts layers to wire integers: levels, frequencies and phases to the

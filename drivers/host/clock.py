@@ -1,4 +1,4 @@
-"""The clock of one amplifier: reading and steering it, and the reports in statuses.
+"""The clock of an amplifier: reading and steering it, and the reports in statuses.
 
 Reading. An amplifier reads its clock for a Status between the last bit of the request and the first
 bit of the reply. The *lead* of a reading is the clock's value minus the earliest arrival of the

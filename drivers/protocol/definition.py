@@ -154,7 +154,7 @@ _QUANTITIES = (
     _word("clock_error", 0, 65535, 10000000, "s"),
 )
 QUANTITIES: dict[str, WireQuantity] = {quantity.name: quantity for quantity in _QUANTITIES}
-"""Quantities by name, including those of the readings below."""
+"""Quantities by name, including the readings below."""
 
 
 def _numbers(*names: str) -> tuple[Number, ...]:
@@ -396,7 +396,7 @@ def name_of(names: Mapping[str, int], number: int) -> str:
 
 SPAN = 1 << 32
 HIGH_STEPS = 1 << 16
-"""Clock steps per step of the high word; shifts and moments are multiples of it."""
+"""Clock steps per step of the high word; shifts and moments are its multiples."""
 HIGH_WORDS = SPAN // HIGH_STEPS
 HIGH_TIME = CLOCK_TURN / HIGH_WORDS
 """Seconds of a step of the high word."""
@@ -451,7 +451,7 @@ def high_word(clock: int) -> int:
 BOOT_TIME = 6.0
 """Timeout [s] of the first reply on a line, for boards that restart when the port is opened."""
 REPLY_TIMEOUT = 0.030
-"""Timeout [s] of a reply on a fast wire; with a heartbeat, three of these are below 150 ms."""
+"""Timeout [s] of a reply on a fast wire; with a heartbeat, three timeouts are below 150 ms."""
 FAST = REPLY_TIMEOUT - REACTION
 """Longest exchange [s] with a reply within that timeout."""
 ATTEMPTS = 3

@@ -3,7 +3,7 @@
 Values are wire integers (see `WireQuantity.to_wire`), except f32 (a float) and texts (str). The
 amplifier reads requests strictly: `Refusal` for a missing, additional or out-of-range word. Replies
 can grow at their end: words after the fields of a record are ignored, and a number that `is_added`
-is None in the reply of an amplifier without it.
+is None if an amplifier does not have it.
 """
 
 import math
@@ -253,7 +253,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """Integers of one quantity, one word each; count: name of the value with their number."""
+    """Integers with a common quantity, one word each; count: name of the field that counts them."""
 
     name: str
     count: str
@@ -361,7 +361,7 @@ class Record:
         ValueError for a value out of range, KeyError for a missing one. Added values without a
         value are left out at the end, and 0 before a field with a value.
 
-        Single-word numbers, nearly all, are packed without a call: every set has dozens of them.
+        Single-word numbers, nearly all, are packed without a call: every set has dozens.
         """
         if self.added:
             unstated = dict.fromkeys(number.name for number in self.added)

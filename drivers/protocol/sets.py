@@ -1,7 +1,7 @@
 """Sets as streams of words: layers, parts and tokens, and the achieved playback.
 
 All numbers are wire integers. A stream contains the layers changed by a set, one after the other; a
-part is the values of one Set message, and the far end collects parts in an `Assembly`.
+part contains the values of a Set message, and the far end collects parts in an `Assembly`.
 `achieved_problem` compares the reply to GetAchieved with the required playback of a layer.
 """
 
@@ -121,7 +121,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class LayerSet:
-    """Content of one layer: without commands it is silenced, or with renew prolonged.
+    """Content of a layer: without commands it is silenced, or with renew prolonged.
 
     after: the commands start when the current onsets of the layer have ended.
     """

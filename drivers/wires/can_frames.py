@@ -21,7 +21,7 @@ _FRAME_BITS = 47 + 8 * BLOCK
 _STUFFED_MAX = (33 + 8 * BLOCK) // 4  # one stuff bit per four at worst
 
 ERROR_ID: Final = 0x800
-"""Identifier, above those of frames, of an adapter's error report; the data are its code."""
+"""Identifier of an adapter's error report, above those for frames; the data are its code."""
 BITRATE: Final = 500_000
 """Default bit rate of a bus [bit/s]."""
 
@@ -139,12 +139,12 @@ def unpack_frames(data: bytes) -> list[CanFrame]:
 
 
 class Assembler:
-    """Assembles the messages of one sender from frames in any order.
+    """Assembles a sender's messages from frames in any order.
 
     Frames with an older number than the last, or of a complete message, are discarded; a newer
     number discards an incomplete message. Without numbers (is_numbered) frame 0 begins a message.
     Two different frames at the same index come from two senders: the message is discarded.
-    Discarded messages count as unexpected, by their frame 0.
+    Discarded messages count as unexpected when their frame 0 arrives.
 
     began: when the first frame of the last message came [s]; given_up: number and begin of an
     incomplete message that the present one has replaced, until a reader resets it.

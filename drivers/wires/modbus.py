@@ -369,7 +369,7 @@ class ModbusWire(Wire):
         return arrival
 
 
-_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=38400, that of its line)"
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=38400, the speed of its line)"
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT or modbus+rtu://HOST:PORT#UNIT"
 _TCP_PORT = 502
 _PARITIES = {"even": "E", "odd": "O", "none": "N"}

@@ -216,7 +216,7 @@ def response_to(request: Pdu | None, adu: Adu) -> Response | None:
 
 
 def reply_in(number: int, response: Response) -> tuple[int, Sequence[int]]:
-    """Return type and words of the reply to a message number, as on other wires.
+    """Return type and words of the reply to a message number.
 
     A result or exception that means a rejection becomes a Nak. Raises Refusal for an unreadable
     identity, and for any other exception.
@@ -333,7 +333,7 @@ class AduReader:
         return [Adu(0, b"", raw=data[:start])]
 
     def _adu_at(self, data: bytes, start: int, size: int, request: Pdu | None) -> Adu | None:
-        """Return the valid frame of a size at a position; None if there is none to accept."""
+        """Return the valid frame of a size at a position, or None."""
         is_whole = 0 < size <= len(data) - start
         adu = checked_adu(data[start : start + size]) if is_whole else None
         is_after_damage = self._is_lost or start > 0

@@ -6,7 +6,7 @@ Every integer is little-endian. Bit 7 of the type is set in replies. The CRC is 
 Ethernet, over everything before it. COBS leaves no zero inside a frame, so a reader resynchronizes
 at the next zero. The leading zero ends preceding noise; empty frames are ignored.
 
-Payloads are words, except those of Hello and its reply, which are the same in every version of the
+Payloads are words, except in Hello and its reply, which are the same in every version of the
 protocol: versions u16 · vendor · product · serial number · firmware, each a length u8 and UTF-8.
 """
 

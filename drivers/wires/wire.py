@@ -189,7 +189,7 @@ class Wire(Protocol):
     delay: float
     """Maximum delay of a frame beyond its bits [s]; `NETWORK_DELAY` over a network."""
     is_kept: bool = False
-    """Whether a frame is repeated until another node accepts it, as on a CAN bus."""
+    """Whether a frame is repeated until another node accepts it, which a CAN bus does."""
     takes: float = 0.0
     """Transmission time of the last request [s]; 0 over a network."""
     blocked: str = "the port takes no bytes: check flow control and the adapter"
@@ -202,7 +202,7 @@ class Wire(Protocol):
     def request(self, address: int, name: str, values: Values, *, has_reply: bool = True) -> bytes:
         """Return the bytes of a request, which counts as sent; address 0: a broadcast.
 
-        has_reply: whether to await a reply; broadcasts and earlier parts of a set have none.
+        has_reply: whether to await a reply; broadcasts and earlier parts of a set get no reply.
         """
 
     def received(self, data: bytes) -> list[Arrival]:
@@ -223,7 +223,7 @@ class Wire(Protocol):
         """Return how long a request with this number of words takes to arrive [s]."""
 
     def exchange_time(self, words: int, reply: int) -> float:
-        """Return the duration [s] of a request and a reply of these word counts; 0: unknown."""
+        """Return the duration [s] of a request and a reply with these word counts; 0: unknown."""
         return self.transit(words) + self.transit(reply)
 
 

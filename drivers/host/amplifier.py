@@ -290,7 +290,7 @@ class Amplifier(AmplifierRecord):
         return asyncio.shield(stop.outcome)
 
     async def _outcome_of(self, stop: PendingStop) -> StopOutcome:
-        """Repeat a stop until it is confirmed or has failed, and return what may play then."""
+        """Repeat a stop until it is confirmed or has failed, and return its outcome."""
         cause = await stop.repeat()
         if stop.is_confirmed:
             self.playback_bound.note_stopped(threads.now())

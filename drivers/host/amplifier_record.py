@@ -1,10 +1,10 @@
-"""What is known of one amplifier, from each request sent to it and each reply.
+"""The state of an amplifier, derived from each request sent to it and each reply.
 
 `AmplifierRecord` notes requests and replies for the line (`Member`), and passes them to the objects
 that keep the state: `AmplifierIdentification`, `SetAdmission` (which set may be sent) with the
 `Ledger`, `Feeding` (the watchdog), `HeldClock`, `StatusContradictions`, and `PlaybackBound`.
-`check_may_send` decides whether a request may be sent, and `what_may_play` what the amplifier may
-still play.
+`check_may_send` decides whether a request may be sent. `what_may_play` decides until when the
+amplifier may still play.
 """
 
 import logging
@@ -60,7 +60,7 @@ _logger = logging.getLogger(__name__)
 
 
 class AmplifierRecord:
-    """What is known of an amplifier on an open line.
+    """The state of an amplifier on an open line.
 
     limits: configured limits. serial_number: expected serial number; None for any. is_output: the
     meaning of full level in the rig: True for the output of a linear amplifier, False for the
@@ -68,7 +68,7 @@ class AmplifierRecord:
     """
 
     identification: AmplifierIdentification
-    """What it has reported about itself."""
+    """Its identity and capabilities."""
     exchange_time: Callable[[str], float]
     """Return how long the longest request with a name and its reply take on the wire [s]."""
     counts: LinkStatistics
@@ -418,7 +418,7 @@ class AmplifierRecord:
         return len(levels) == self.capabilities["channels"] and not any(levels)
 
     def what_may_play(self, cause: str = "", stop: PendingStop | None = None) -> StopOutcome:
-        """Return what it may still play: the only place where that is decided.
+        """Return until when it may still play; no other function decides this.
 
         cause: why its state is unknown; by default the reason why it is mute or its line lost.
         stop: the stop whose outcome is wanted; None: without one, its silence is never confirmed.

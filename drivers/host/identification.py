@@ -1,4 +1,4 @@
-"""Identification of one amplifier: who it is, what it can do, and who else is on its line."""
+"""Identification of an amplifier: identity, capabilities, and other devices at its address."""
 
 import math
 
@@ -50,7 +50,7 @@ class AmplifierIdentification:
         self.is_complete = False
 
     def expect_one(self) -> None:
-        """Expect the reply of one amplifier from now on."""
+        """Expect a single reply to the next Hello."""
         self._are_several = False
 
     def check_alone(self) -> None:

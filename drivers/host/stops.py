@@ -1,4 +1,4 @@
-"""Stops of one amplifier, and bounds on what it may play after them.
+"""Stops of an amplifier, and bounds on its playback after them.
 
 `PendingStop` repeats a stop until a status confirms it. `PlaybackBound` keeps what confirmed stops,
 arming and clearing show about the end of playback; `AmplifierRecord.what_may_play` combines it with
@@ -73,7 +73,7 @@ class PlaybackBound:
 
 
 class StoppableAmplifier(Member, Protocol):
-    """What a stop needs of its amplifier."""
+    """The amplifier of a stop."""
 
     line: Line
     latch: int | None

@@ -1,4 +1,4 @@
-"""The watchdog of one amplifier: when it was fed, and when it must have silenced the amplifier.
+"""The watchdog of an amplifier: when it was fed, and when it must have silenced the amplifier.
 
 All times [s] refer to one arbitrary clock.
 """

@@ -128,11 +128,7 @@ class LayerAllocation:
         """Take slots as the playback from now on; started: layers that start another content."""
         self.slots = slots
         self.may_play |= started
-        self._layer_of = {
-            slot.content.key: number
-            for number, slot in slots.items()
-            if slot.phase is not SlotPhase.FALLING
-        }
+        self._layer_of = _layers_by_key(slots)
 
     def confirm(self, changed: Set[int]) -> None:
         """Note that the amplifiers play changed layers as in their slots, or have ended them."""
@@ -151,6 +147,7 @@ class LayerAllocation:
     def resume(self, slots: Mapping[int, Slot], *, without: Collection[int]) -> None:
         """Take former slots as the playback again, except those of some layers."""
         self.slots = {number: slot for number, slot in slots.items() if number not in without}
+        self._layer_of = {**self._layer_of, **_layers_by_key(self.slots)}
 
     def start_silence(self) -> None:
         """Note that all layers are to fall silent; they may play until `confirm_silence`."""
@@ -160,6 +157,15 @@ class LayerAllocation:
     def confirm_silence(self) -> None:
         """Note that all layers are silent for certain."""
         self.may_play = frozenset()
+
+
+def _layers_by_key(slots: Mapping[int, Slot]) -> dict[ContentKey, int]:
+    """Return the layers of contents that no other content replaces, by finger and voice."""
+    return {
+        slot.content.key: number
+        for number, slot in slots.items()
+        if slot.phase is not SlotPhase.FALLING
+    }
 
 
 def _is_one_voice(content: Content, other: Content) -> bool:

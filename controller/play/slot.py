@@ -166,13 +166,14 @@ class Slot:
     def put_off(self, until: float, *, is_update: bool) -> None:
         """Note that its renewal or update was refused until a time [s].
 
-        A refused ending or fall is not sent again.
+        A refused ending is not sent again.
         """
         if not is_update:
             self.renewal_due = until
             return
         self.ending_due = math.inf
-        self.fall_due = math.inf
+        if self.fall_due < math.inf:
+            self.fall_due = until
         if self.content.course is not None:
             self.piece_due = until
 

@@ -32,9 +32,10 @@ from controller.play.intent import (
     Selection,
     Target,
 )
+from controller.play.layer_allocation import LayerAllocation
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import Slot, SlotPhase
+from controller.play.slot import CROSSFADE, Slot, SlotPhase
 from controller.play.slots import Slots
 from controller.sources.touch import Contact, ContactKey
 from kit.chain import FINGER, set_running
@@ -133,6 +134,29 @@ def test_slots_change_only_when_a_plan_is_adopted() -> None:
     slots.adopt(silence, 0.1)
     assert (slots.by_layer, slots.layers.may_play) == ({}, {0})  # until it is confirmed
     assert slots.silence(0.01).is_empty
+
+
+def test_a_replacement_that_was_dropped_still_fades_when_it_is_tried_again() -> None:
+    """The former content plays on in its layer, which is its finger's again; its fall is retried.
+
+    A ledger that refuses the fall until 1.1 s has it sent then, so the two do not sound together.
+    """
+    key = CONTACTS[0].key
+    targets = (FingerTarget(CONTACTS[0], Target(key, 14.0)),)
+    former_layer = Layer({"SW": Tone(100.0, 1e-6)})
+    former = Content(ContentKey(key, 0), targets, Placement((LEFT,)), former_layer)
+    later = replace(former, layer=Layer({"SW": Tone(150.0, 1e-6)}), is_led=True)
+    layers = LayerAllocation(4)
+    playing = {0: Slot(former, former.layer)}
+    layers.take(playing, {0})
+    assert layers.allocate([later]) == {1: later}
+    falling = playing[0].falling(1.0)
+    layers.take({0: falling, 1: Slot(later, later.layer)}, {1})
+    layers.resume(playing, without=())
+    assert layers.allocate([later]) == {2: later}
+    assert layers.fade_time(2, later) == CROSSFADE
+    falling.put_off(1.1, is_update=True)
+    assert falling.update_due == 1.1
 
 
 FREE = playable()

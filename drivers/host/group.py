@@ -26,6 +26,7 @@ from drivers.host.group_clocks import Clocks
 from drivers.host.group_states import REACTIONS, Failure, GroupState
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.joint_sets import JointSets, PlayedSet, UnplayedSet
+from drivers.host.line import Line
 from drivers.host.members import Members, is_lost, outcomes
 from drivers.host.requests import Priority
 from drivers.host.set_admission import IsPreempted
@@ -151,15 +152,24 @@ class Group:
                 "amplifiers are being stopped or disarmed; arm again if that is still wanted"
             )
 
+    def _draw_sessions(self, amplifiers: Sequence[Amplifier]) -> dict[Line, int]:
+        """Draw a session for each line that none of the amplifiers held last."""
+        drawn = self.draw(_SESSION.minimum, _SESSION.maximum)
+        while True:
+            sessions = {
+                line: (drawn + number) % _SESSION.maximum + 1
+                for number, line in enumerate(self.members.lines)
+            }
+            if all(amplifier.session != sessions[amplifier.line] for amplifier in amplifiers):
+                return sessions
+            drawn += 1
+
     async def _arm_all(self, amplifiers: Sequence[Amplifier], epoch: int) -> None:
         """Arm amplifiers that are disarmed; disarm them after a failure or a newer stop."""
         members = self.members
         await self._clocks.settle()
         members.check_none_since(epoch)
-        drawn = self.draw(_SESSION.minimum, _SESSION.maximum)
-        sessions = {}
-        for number, line in enumerate(members.lines):
-            sessions[line] = (drawn + number) % _SESSION.maximum + 1
+        sessions = self._draw_sessions(amplifiers)
         arms = [amplifier.arm(sessions[amplifier.line], self._watchdog) for amplifier in amplifiers]
         arming = asyncio.ensure_future(outcomes(arms))
         try:

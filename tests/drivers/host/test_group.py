@@ -311,6 +311,14 @@ async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> N
     assert shown == {False, True}
 
 
+@grouped(("a",), wire="serial")
+async def test_arming_again_uses_another_session(group: Group, ends: list[MemoryLine]) -> None:
+    """Even if the same number is drawn; an amplifier refuses the session that it held last."""
+    await group.disarm()
+    await group.arm()
+    assert group.is_armed
+
+
 @pytest.mark.parametrize("what", ["cables", "replies"])
 @pytest.mark.parametrize("wire", KINDS)
 @grouped(("a",), ("b",))

@@ -225,8 +225,9 @@ class Amplifier(AmplifierRecord):
 
         Raises CommandRefused if the amplifier is not silent soon after the ramp, or is still armed.
         """
-        status = await self.request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
-        end = threads.now() + ramp + CONFIRM_TIMEOUT
+        wire_ramp = self.wire_ramp(ramp)
+        status = await self.request("Disarm", {"ramp": wire_ramp}, Priority.SILENCE)
+        end = threads.now() + _RAMP.from_wire(wire_ramp) + CONFIRM_TIMEOUT
         while status["state"] in _ENERGISED or not self.is_silent(status):
             if threads.now() > end or status["state"] == ENABLED:
                 raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")

@@ -352,7 +352,8 @@ def achieved_problem(
     factor; slack: in steps of the wire, in addition to the steps of the amplifier.
     """
     achieved = {command["channel"]: command for command in reply["commands"]}
-    shares: dict[int, float] = {}
+    levels: list[int] = []
+    shares: list[float] = []
     beyond = achieved.keys() - {tone.channel for tone in layer.commands}
     if beyond:
         return "commit", "channels that are not driven", "none", sorted(beyond)
@@ -374,10 +375,11 @@ def achieved_problem(
                 rule = "plays" if tone.channel in achieved else "commit"
                 return rule, quantity, f"0 to {allowed:g}", error
         if tone.level and can_scale:
-            shares[tone.level] = got["level"] / tone.level
-    apart = max(shares.values(), default=0.0) - min(shares.values(), default=0.0)
-    if apart > _DERATED + can.get("level_step", 1) / min(shares, default=1):
-        return "commit", "shares of its channels", "alike", sorted(shares.values())
+            levels.append(tone.level)
+            shares.append(got["level"] / tone.level)
+    difference = max(shares, default=0.0) - min(shares, default=0.0)
+    if difference > _DERATED + can.get("level_step", 1) / min(levels, default=1):
+        return "commit", "shares of its channels", "alike", sorted(shares)
     return None
 
 

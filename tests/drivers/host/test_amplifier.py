@@ -92,6 +92,17 @@ def test_more_than_that_is_one(name: str) -> None:
     assert name in problem[1]
 
 
+def test_channels_of_one_level_are_scaled_alike() -> None:
+    """Two channels at the same level, one at half of it: a common factor does not explain that."""
+    tones = (Command(0, 2000, 5000, 0), Command(1, 2000, 5000, 0))
+    layer = replace(SENT, commands=tones)
+    halves = [replace(tone, level=2500) for tone in tones]
+    limits = {"is_exact": False, "can_scale": True}
+    assert achieved_problem(layer, shown(*halves), CAN, **limits) is None
+    problem = achieved_problem(layer, shown(halves[0], tones[1]), CAN, **limits)
+    assert problem[1] == "shares of its channels"
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @in_virtual_time
 async def test_voltage_and_current_of_each_channel(kind: str) -> None:

@@ -134,7 +134,7 @@ class VoiceTransition:
         if time >= self.end and (time > self.end or self.step):
             return 0.0
         points = (self.first, *self.knots, self.last)
-        passed = int((time - self.start) / self.step) if self.knots else 0
+        passed = max(0, int((time - self.start) / self.step)) if self.knots else 0
         lines = pairwise(points[passed:])
         return steepest(lines, self.step, is_cosine=not self.knots).change
 
@@ -598,8 +598,16 @@ class Playback:
         for number, layer in self._layers.items():
             if layer.waiting is not None:
                 return math.inf
-            ends += self._fade_ends(number, layer) or [layer.ends]
+            if self._goes_on(number):
+                ends += self._fade_ends(number, layer) or [layer.ends]
         return max(ends, default=-math.inf)
+
+    def _goes_on(self, number: int) -> bool:
+        """Whether a voice of a layer does not fall silent along its present transition."""
+        return any(
+            voice.layer == number and not voice.has_ended and voice.transition.last != 0
+            for voice in chain.from_iterable(self.all_voices)
+        )
 
     def _fade_ends(self, number: int, layer: _Layer) -> list[float]:
         """Return when the voices of a layer have faded [s] after it ends by itself."""

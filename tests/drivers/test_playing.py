@@ -29,13 +29,22 @@ import serial
 
 from drivers import ports
 from drivers.errors import LinkError, LinkTimeout
-from drivers.playing import Playback, Voice
+from drivers.playing import Playback, Voice, along
 from drivers.ports import Port, SerialPort, open_connection
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.urls import Endpoint
 from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
 from kit.clock import in_virtual_time
 from kit.courses import Taken, courses, follow
+
+
+def test_slope_counts_the_whole_onset_before_it_starts() -> None:
+    """By hand: from 0 to 0.4 in 4 ms, then flat for 16 ms: 100 full levels/s are still to come."""
+    onset = Envelope(40, ((4000, 0),) * 4)
+    transition = along(onset, 1.0, 0.0, 0j, 0.4 + 0j)
+    for time in (0.9, 0.994, 1.0, 1.003):
+        assert transition.slope(time) == pytest.approx(100.0)
+    assert transition.slope(1.005) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -311,6 +311,16 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked | Callable[[Ledger], Led
             Asked(1.9, AmplifierLayer(0, (), ramp=1.0), longest=100),
         ],
     ),
+    # Nothing vibrates from 2 s on: one layer ends by itself, the other at 1 s by tones of level 0.
+    "a layer that was ended by level zero": (
+        replace(WIDE, on_time=5.0),
+        [
+            plays(0.0, AmplifierLayer(0, (tone(0, level=0.3),), valid_for=2.0)),
+            plays(0.0, AmplifierLayer(1, (tone(1, level=0.3),), valid_for=2.0)),
+            plays(1.0, AmplifierLayer(1, (tone(0, level=0.0), tone(1, level=0.0)))),
+            Asked(6.0, AmplifierLayer(0, (tone(),), valid_for=1.0), valid_for=(1000, 1000)),
+        ],
+    ),
     # 2 s of 10 s: after two of 0.5 s and a ramp of 20 ms, 0.94 s and such a ramp are left; each may
     # have been played up to 0.1 s later.
     "duty": (

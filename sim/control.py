@@ -341,10 +341,10 @@ async def execute(context: SimulationContext, line: bytes, *, now: float) -> _Re
     except ValidationError as error:
         key, problem = first_problem(error)
         return {"error": f"{key[:_MAX_KEY]}: {problem}".removeprefix(": ")}
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        return {"error": f"invalid JSON: {error}"}
     except InputError as error:
         return {"error": str(error)}
+    except (ValueError, RecursionError) as error:  # JSON, UTF-8, or a number with too many digits
+        return {"error": f"invalid JSON: {error}"}
     except OSError as error:
         if not error.strerror:
             return {"error": str(error)}

@@ -217,6 +217,7 @@ async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
         b'{"op": "felt", "since_s": 2, "until_s": 1}\n',
         b'{"op": "felt", "since_s": "0", "until_s": 1}\n',
         b"[" * 60_000 + b"\n",
+        b'{"op": "felt", "since_s": ' + b"1" * 5000 + b"}\n",
     ],
 )
 async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:

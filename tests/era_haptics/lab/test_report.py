@@ -171,11 +171,11 @@ RECORDS = {
     "traceback": (
         {
             "traceback": 'Traceback:\n  File "/home/swordfish/x.py", line 3, in f\n'
-            '  File "/opt/era/controller/cli/main.py", line 12, in run\nValueError: swordfish'
+            '  File "/opt/era/controller/cli/commands.py", line 12, in run\nValueError: swordfish'
         },
         {
             "traceback": "Traceback\n  File hidden, line 3\n"
-            "  File controller/cli/main.py, line 12\nValueError: …"
+            "  File controller/cli/commands.py, line 12\nValueError: …"
         },
     ),
 }

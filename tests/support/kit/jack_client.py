@@ -24,8 +24,14 @@ def jack_client(name: str, server: str | None = None) -> "jack.Client":
     deadline = time.monotonic() + _START
     while True:
         try:
-            return jack.Client(name, use_exact_name=True, no_start_server=True, servername=server)
+            client = jack.Client(name, no_start_server=True, servername=server)
         except jack.JackOpenError as problem:
-            if problem.status.name_not_unique or time.monotonic() > deadline:
+            if time.monotonic() > deadline:
                 raise LinkError(f"jack: client {name} cannot be opened: {problem}") from None
             time.sleep(_POLL)
+            continue
+        if client.name == name:
+            return client
+        # The server has added a number. Asked for the exact name, it does not say what was wrong.
+        client.close()
+        raise LinkError(f"jack: client {name} cannot be opened: there is another of that name")

@@ -260,8 +260,12 @@ def playing(desk: Desk, *, level_db_sl: float) -> Iterator[Client]:
         started.stdout.readline()
         running(stack, daemon, desk.folder, desk.environment, log)
         era = stack.enter_context(connected(socket))
-        until_ready(era)
-        yield era
+        try:
+            until_ready(era)
+            yield era
+        except BaseException:
+            sys.stderr.write((desk.folder / "touches.log").read_text("utf-8"))
+            raise
 
 
 def connected(socket: Path) -> Client:

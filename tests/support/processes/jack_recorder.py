@@ -130,7 +130,10 @@ def record(server: str, name: str, channels: int, kind: str, path: str) -> None:
         name = line.strip()
         if name.endswith(":"):
             sources = client.get_ports(f"^{name}", is_audio=True, is_output=True)
-            for source, own in zip(sources, inputs, strict=True):
+            if len(sources) < len(inputs):
+                raise ValueError(f"{name} must have {len(inputs)} outputs, got {len(sources)}")
+            # A plate has another output after its sensors: the loop-back.
+            for source, own in zip(sources, inputs, strict=False):
                 client.connect(source, own)
             _answer(len(sources))
         else:

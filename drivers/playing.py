@@ -598,14 +598,14 @@ class Playback:
         for number, layer in self._layers.items():
             if layer.waiting is not None:
                 return math.inf
-            if self._goes_on(number):
+            if layer.ends < math.inf or self._lasts(number):
                 ends += self._fade_ends(number, layer) or [layer.ends]
         return max(ends, default=-math.inf)
 
-    def _goes_on(self, number: int) -> bool:
-        """Whether a voice of a layer does not fall silent along its present transition."""
+    def _lasts(self, number: int) -> bool:
+        """Whether a layer has a tone that lasts; tones at level 0 do not."""
         return any(
-            voice.layer == number and not voice.has_ended and voice.transition.last != 0
+            voice.layer == number and voice.silent_from == math.inf
             for voice in chain.from_iterable(self.all_voices)
         )
 

@@ -47,6 +47,17 @@ def test_slope_counts_the_whole_onset_before_it_starts() -> None:
     assert transition.slope(1.005) == 0.0
 
 
+@pytest.mark.parametrize(("valid_for", "end"), [(1000, 1.4), (0, 0.008)])
+def test_layer_at_level_zero_is_silent_once_its_ending_is_over(valid_for: int, end: float) -> None:
+    """By hand: after 1 s its ending takes four steps of 0.1 s; without end, an onset takes 8 ms."""
+    onset = Envelope(40, ((5000, 0),))
+    ending = Envelope(1000, ((8000, 0),) * 3)
+    playback = Playback(1, 8)
+    tone = Command(0, 4000, 0, 0, onset=onset, ending=ending)
+    playback.commit([LayerSet(0, 0, valid_for, (tone,))], 1, 0.0)
+    assert playback.ends_by == pytest.approx(end)
+
+
 @pytest.mark.parametrize(
     ("device", "parity"), [("/dev/ttyUSB9", serial.PARITY_ODD), ("/dev/pts/9", serial.PARITY_NONE)]
 )

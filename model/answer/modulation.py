@@ -7,7 +7,8 @@ content at its frequency. The carrier is chosen for all three together, near the
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -116,52 +117,37 @@ def _fits(
     return bool(is_symmetric and is_in_band and is_playable and is_apart)
 
 
-@dataclass
-class _ContentAlone:
-    """A content of an answer at other frequencies, with all other fingers quiet."""
-
-    table: LocalizationTable
-    result: Answer
-    number: int
-    """Number of the content."""
-    _tones: dict[int, Tones] = field(default_factory=dict)
-
-    def at(self, row: int) -> Tones:
-        """Return its tone at a row of the table's frequencies."""
-        if row not in self._tones:
-            self._tones[row] = self._solved(row)
-        return self._tones[row]
-
-    def _solved(self, row: int) -> Tones:
-        contents = self.result.contents
-        stream = contents.streams[self.number]
-        (target,) = stream.targets
-        level_db_sl = stream.level_db_sl
-        if stream.course is not None:
-            level_db_sl -= stream.course.strongest_db
-        quiet = [
-            number
-            for number, finger in enumerate(self.result.asked)
-            if number != target and not finger.is_load
-        ]
-        background = None if quiet else self.table.background([contents.places[target]])
-        alone = replace(
-            contents,
-            streams=(Stream((target,), level_db_sl, ((row, row + 1),)),),
-            quiet=tuple(quiet),
-            background=background,
-        )
-        return choose_tones(self.table, alone)
+def _tone_alone(table: LocalizationTable, result: Answer, number: int, row: int) -> Tones:
+    """Return a content's tone at a row of the table's frequencies, with all other fingers quiet."""
+    contents = result.contents
+    stream = contents.streams[number]
+    (target,) = stream.targets
+    level_db_sl = stream.level_db_sl
+    if stream.course is not None:
+        level_db_sl -= stream.course.strongest_db
+    quiet = [
+        finger_number
+        for finger_number, finger in enumerate(result.asked)
+        if finger_number != target and not finger.is_load
+    ]
+    background = None if quiet else table.background([contents.places[target]])
+    alone = replace(
+        contents,
+        streams=(Stream((target,), level_db_sl, ((row, row + 1),)),),
+        quiet=tuple(quiet),
+        background=background,
+    )
+    return choose_tones(table, alone)
 
 
 def _with_best_carrier(
     table: LocalizationTable, result: Answer, number: int, candidates: Sequence[Sequence[int]]
 ) -> Answer:
     """Give a content the carrier and side bands with the best contrast, within the stroke."""
-    content = _ContentAlone(table, result, number)
-    contrasts = [_contrast_db([content.at(row) for row in rows]) for rows in candidates]
+    tone_at = cache(partial(_tone_alone, table, result, number))
+    contrasts = [_contrast_db([tone_at(row) for row in rows]) for rows in candidates]
     best_rows = candidates[best_of(contrasts)]
-    modulated = [content.at(row) for row in best_rows]
+    modulated = [tone_at(row) for row in best_rows]
     full_gains = np.array([tones.gains[0] for tones in modulated])
     gains = _AMPLITUDES * 10 ** (-_ALL_DB / 20) * full_gains
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.commands.options import (
+    FittedRigOption,
     JsonOption,
     MeshOption,
     RigArgument,
@@ -113,15 +114,7 @@ def calibrate(
     measured_file: Annotated[
         Path, typer.Argument(metavar="MEASURED", help="Responses, .uff, .unv or .csv.")
     ],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="RIG.fitted.yaml",
-            help="Output file for the fitted rig, preferably in the folder of RIG.",
-        ),
-    ],
+    output: FittedRigOption,
     mesh: MeshOption = None,
     all_scales: Annotated[
         bool,

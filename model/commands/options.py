@@ -31,6 +31,15 @@ MeshOption = Annotated[
         help="Mesh, as in a rig file: auto, 12x9 or '12x9 Q3'. Default: the rig's.",
     ),
 ]
+FittedRigOption = Annotated[
+    Path,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="RIG.fitted.yaml",
+        help="Output file for the fitted rig, preferably in the folder of RIG.",
+    ),
+]
 FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
 ]

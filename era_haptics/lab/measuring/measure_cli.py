@@ -9,6 +9,14 @@ import typer
 from model.commands.options import JsonOption, RigArgument, next_line, print_report
 from model.errors import InputError
 
+PeakOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Peak sample of each output, 0 to 1 of full scale. Default: 0.3, or less if the "
+        "rig's limits require it."
+    ),
+]
+
 
 def measure(
     rig_file: RigArgument,
@@ -44,13 +52,7 @@ def measure(
             "limits, 10 Hz apart.",
         ),
     ] = None,
-    level: Annotated[
-        float | None,
-        typer.Option(
-            help="Peak sample of each output, 0 to 1 of full scale. Default: 0.3, or less if the "
-            "rig's limits require it."
-        ),
-    ] = None,
+    level: PeakOption = None,
     periods: Annotated[
         int,
         typer.Option(

@@ -13,8 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from era_haptics.lab.measuring.measure_cli import PeakOption
 from model.commands.calibrate_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
-from model.commands.options import FAILED, JsonOption, RigArgument, print_report, progress_bar
+from model.commands.options import (
+    FAILED,
+    FittedRigOption,
+    JsonOption,
+    RigArgument,
+    print_report,
+    progress_bar,
+)
 from model.errors import InputError
 from model.quantities import counted
 
@@ -26,22 +34,8 @@ if TYPE_CHECKING:
 
 def identify(
     rig_file: RigArgument,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="RIG.fitted.yaml",
-            help="Output file for the fitted rig, preferably in the folder of RIG.",
-        ),
-    ],
-    level: Annotated[
-        float | None,
-        typer.Option(
-            help="Peak sample of each output, 0 to 1 of full scale. Default: 0.3, or less if the "
-            "rig's limits require it."
-        ),
-    ] = None,
+    output: FittedRigOption,
+    level: PeakOption = None,
     measured_file: Annotated[
         Path | None,
         typer.Option(

@@ -89,6 +89,16 @@ sys.exit(main())
 """`era` whose software amplifier survives stalls: the kernel's timer that would kill it is off."""
 
 
+def soft_amp_program(*, is_watched: bool) -> list[str]:
+    """Return the start of a command line of `era soft-amp`.
+
+    is_watched: whether the kernel kills it when its sound stalls for 0.1 s, which a busy machine
+    may cause.
+    """
+    program = [str(ERA)] if is_watched else [sys.executable, "-c", UNWATCHED]
+    return [*program, "soft-amp"]
+
+
 class SoftAmp:
     """A running `era soft-amp`; url: of its first amplifier.
 
@@ -99,10 +109,9 @@ class SoftAmp:
         self, *options: str, environment: dict[str, str], log: Path, is_watched: bool = True
     ) -> None:
         self._log = log
-        program = [ERA] if is_watched else [sys.executable, "-c", UNWATCHED]
         with log.open("wb") as errors:
             self.process = subprocess.Popen(
-                [*program, "soft-amp", *options, "--until-eof"],
+                [*soft_amp_program(is_watched=is_watched), *options, "--until-eof"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,

@@ -109,7 +109,7 @@ class ContactTracker:
                     continue
                 up += self._lift([evicted])
             self._contacts[key] = self._contact(key, touch, former, frame.time)
-        return self._change(former_contacts, up, frame.time, rejected)
+        return self._finish(former_contacts, up, frame.time, rejected)
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
@@ -121,7 +121,7 @@ class ContactTracker:
         for name, frame in self._frames.items():
             if frame.time > now:
                 self._frames[name] = replace(frame, time=now)
-        return self._change(former_contacts, up, now)
+        return self._finish(former_contacts, up, now)
 
     def wait_again(self, answered: Mapping[ContactKey | None, float]) -> None:
         """Mark contacts as changed since these times [s]: their answer was not played."""
@@ -167,13 +167,14 @@ class ContactTracker:
 
     def _lifted_by(self, source: str, touches: Collection[ContactKey]) -> list[ContactKey]:
         """Return the contacts of a source that its touches end."""
-        lifted = []
-        for key in self._contacts:
-            # A kept tap ends when its id returns, since that is another touch.
-            is_lifted = (key in touches) == (key in self._tap_ends)
-            if key.source == source and is_lifted:
-                lifted.append(key)
-        return lifted
+        own_keys = [key for key in self._contacts if key.source == source]
+        return [key for key in own_keys if self._is_ended(key, touches)]
+
+    def _is_ended(self, key: ContactKey, touches: Collection[ContactKey]) -> bool:
+        """Whether the touches of its source end a contact."""
+        if key in self._tap_ends:  # lifted already, so the same id is another touch
+            return key in touches
+        return key not in touches
 
     def _evicted_by(self, source: str) -> ContactKey | None:
         """Return the contact to lift for a new contact of a source, or None."""
@@ -197,37 +198,51 @@ class ContactTracker:
             self._tap_ends.pop(contact.key, None)
         return lifted
 
-    def _change(
+    def _finish(
         self,
         former_contacts: Mapping[ContactKey, Contact],
         up: tuple[Contact, ...],
         time: float,
         rejected: Sequence[str] = (),
     ) -> Change:
-        """Determine surplus contacts, and return the changes at a time [s].
+        """Finish an update at a time [s]: mark surplus contacts, and note and return all changes.
 
-        up: contacts lifted since former_contacts. Sources without contacts are forgotten.
+        up: contacts lifted since former_contacts.
         """
         self._mark_surplus()
+        self.contacts = tuple(self._contacts.values())
+        change = self._change(former_contacts, up, rejected)
+        self._note_changes((*change.down, *change.moved, *change.pressed), up, time)
+        self._update_times()
+        return change
+
+    def _change(
+        self,
+        former_contacts: Mapping[ContactKey, Contact],
+        up: tuple[Contact, ...],
+        rejected: Sequence[str],
+    ) -> Change:
+        """Compare the contacts with their former states."""
         down = []
         moved = []
         pressed = []
-        for key, contact in self._contacts.items():
-            former = former_contacts.get(key)
+        for contact in self.contacts:
+            former = former_contacts.get(contact.key)
             if former is None:
                 down.append(contact)
             elif (former.x, former.y) != (contact.x, contact.y):
                 moved.append(contact)
             elif former != contact:
                 pressed.append(contact)
-        self._note_changes((*down, *moved, *pressed), up, time)
-        self.contacts = tuple(self._contacts.values())
+        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
+
+    def _update_times(self) -> None:
+        """Forget sources without contacts; determine the newest frame and the next expiry."""
         self._frames = {key.source: self._frames[key.source] for key in self._contacts}
         frames = self._frames.values()
         self._newest = max([frame.time for frame in frames], default=-math.inf)
         expiries = [*self._tap_ends.values(), *(frame.expiry for frame in frames)]
         self.next_expiry = min(expiries, default=math.inf)
-        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
 
     def _mark_surplus(self) -> None:
         """Mark all fingers beyond max_fingers as surplus; hands do not count."""

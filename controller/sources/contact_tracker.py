@@ -93,10 +93,13 @@ class ContactTracker:
         touches: dict[ContactKey, Touch] = {}
         if math.isfinite(frame.time):
             touches = _valid_touches(frame, self._plate, rejected)
-        elif frame.touches:
-            rejected.append("no_time")
-        if keeps_taps:
-            self._keep_taps(frame)
+            if keeps_taps:
+                self._keep_taps(frame)
+        else:
+            if frame.touches:
+                rejected.append("no_time")
+            # The contacts of its source are lifted at the time of the newest frame.
+            frame = replace(frame, time=self._newest)
         up = self._lift(self._lifted_by(frame.source, touches))
         self._frames[frame.source] = frame
         former_contacts = dict(self._contacts)

@@ -284,6 +284,12 @@ SCENARIOS: Mapping[str, Sequence[Then]] = {
         Then(frame(2.01, (1, 0.1, 0.5)), down=[TAP], up=[TAP], keeps_taps=True),
         Then(frame(2.02), [], up=[TAP], keeps_taps=True),  # 10 ms are no glimpse
     ],
+    "a tap whose source then sends no time": [
+        Then(frame(1.0, (1, 0.5, 0.5))),
+        Then(frame(1.001), [TAP], keeps_taps=True),
+        Then(frame(math.nan), [TAP], keeps_taps=True),
+        Then(1.0601, [], up=[TAP], expiry=math.inf),
+    ],
     # A touch off the plate, one too many, and a source that times out lift at once.
     "no tap": [
         Then(frame(1.0, (1, 0.5, 0.5))),
@@ -326,6 +332,17 @@ def test_frames_become_contacts(name: str) -> None:
         wanted = {what: getattr(then, what) for what in found}
         wanted = {what: each for what, each in wanted.items() if each is not None}
         assert {what: found[what] for what in wanted} == wanted, then
+
+
+@pytest.mark.parametrize("time", [math.nan, math.inf])
+def test_lifts_are_dated_by_the_newest_frame_when_their_own_has_no_time(time: float) -> None:
+    """The latency of a lift counts from the last known time, so it is a number."""
+    tracker = ContactTracker(PLATE)
+    tracker.update(frame(1.0, (1, 0.5, 0.5)))
+    tracker.update(frame(1.02, (1, 0.5, 0.5), source="b"))
+    tracker.forget_changes()
+    tracker.update(frame(time))
+    assert tracker.changed == {None: 1.02}
 
 
 def test_tracker_follows_loads_in_steps_once_a_finger_has_landed() -> None:

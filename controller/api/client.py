@@ -12,7 +12,7 @@
 
 `Client` runs an `AsyncClient` in an event loop on its own thread. A `ClientSession` is one of its
 connections, a `LeaseRenewal` keeps the plate armed. `make pages` generates the methods that send a
-single request from their registrations in `controller/daemon/handlers.py`.
+single request from `METHODS`.
 """
 
 import asyncio
@@ -55,6 +55,8 @@ from controller.api.link import (
     read_result,
     touches_at,
 )
+
+# begin: written by docs/generators/client_stub.py results
 from controller.api.methods import (
     DEFAULT_LEASE,
     METHODS,
@@ -69,6 +71,8 @@ from controller.api.methods import (
     StopResult,
     StrengthResult,
 )
+
+# end
 from controller.api.schema import ApiMessage, Empty, Topic
 from controller.api.silencing import readable_params
 from model.errors import InputError

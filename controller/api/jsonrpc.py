@@ -64,9 +64,8 @@ class ErrorData(ApiMessage):
     what: str
     where: str | None = None
     remedy: str | None = None
-    amplifiers: dict[str, AmplifierSilence] | None = Field(
-        default=None, description="by name; of error 1006 only"
-    )
+    amplifiers: dict[str, AmplifierSilence] | None = None
+    """by name; of error 1006 only"""
 
 
 class RpcError(Exception):

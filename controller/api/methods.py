@@ -1,13 +1,11 @@
 """The methods and topics of the API: their messages, and how requests and events are treated.
 
-`api_method` registers a method at its handler (`controller/daemon/handlers.py`). From the
-registrations, `make pages` generates everything that clients, the gateway and pages need without
-loading the daemon: `METHODS` below, the methods of the clients, `summaries.py` and
-docs/reference/api.md. Each topic is a row of `TOPICS`.
+Each method is a row of `METHODS`, handled by the method of `ApiService` with the same name
+(`controller/daemon/handlers.py`), whose docstring is the summary. `make pages` writes the methods
+of the clients, `summaries.py` and docs/reference/api.md. Each topic is a row of `TOPICS`.
 """
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import FailFast, Field
 
@@ -54,85 +52,71 @@ class HelloParams(ApiMessage):
 class HelloResult(ApiMessage):
     """Rig, table and layout of the daemon; only the layout can change while it runs."""
 
-    api_version: str = Field(description="major.minor; major versions are incompatible")
+    api_version: str
+    """major.minor; major versions are incompatible"""
     software_version: str
     rig: RigSummary
     table: TableSummary
-    rig_text: str = Field(description="the rig file, from which vibration fields can be computed")
-    layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
-    readings: dict[str, tuple[str, str, Count]] = Field(
-        {},
-        description="label, unit and decimals of the amplifier readings to show, by key of the "
-        "status",
-    )
+    rig_text: str
+    """the rig file, from which vibration fields can be computed"""
+    layout: dict[str, Any] | None
+    """the surface layout; null without one"""
+    readings: dict[str, tuple[str, str, Count]] = Field({})
+    """label, unit and decimals of the amplifier readings to show, by key of the status"""
 
 
 class StrengthResult(ApiMessage):
     """Strengths of all known touch sources, clients and regions."""
 
-    strengths: dict[str, float] = Field(
-        default={},
-        description="gain in dB by name (0 if not set), for configured inputs, sources that have "
-        "had fingers, connected clients, regions of the current layout, and all "
-        "other names with a gain",
-    )
+    strengths: dict[str, float] = Field({})
+    """gain in dB by name (0 if not set), for configured inputs, sources that have had fingers,
+    connected clients, regions of the current layout, and all other names with a gain"""
 
 
 class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     """State of the daemon, the amplifiers and the plate."""
 
-    time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
-    unix_time_s: float = Field(description="the same time on the wall clock")
+    time_s: float
+    """time of this response on CLOCK_MONOTONIC"""
+    unix_time_s: float
+    """the same time on the wall clock"""
     state: DaemonStateName
-    word: str = Field(
-        default_factory=lambda known: STATE_WORDS[known["state"]],
-        description="the state in plain words",
-    )
+    word: str = Field(default_factory=lambda known: STATE_WORDS[known["state"]])
+    """the state in plain words"""
     epoch: Epoch
-    assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
-    lost_for_s: float | None = Field(
-        description="how long a link has been lost; null if all are up"
-    )
-    watchdog_s: float = Field(
-        description="time without heartbeats after which an armed amplifier silences itself"
-    )
+    assume_energised: bool
+    """whether lost amplifiers may still be playing"""
+    lost_for_s: float | None
+    """how long a link has been lost; null if all are up"""
+    watchdog_s: float
+    """time without heartbeats after which an armed amplifier silences itself"""
     armed_by: str | None
     lease_left_s: float | None
-    silence_reason: str | None = Field(None, description="why nothing plays while armed")
+    silence_reason: str | None = None
+    """why nothing plays while armed"""
     amplifiers: list[AmplifierStatus]
-    latency_ms: LatencySummary = Field(
-        description="after a finger landed, moved or changed its pressure"
-    )
-    lift_latency_ms: LatencySummary | None = Field(
-        None, description="after a lift, or a change without a touch, such as the end of an effect"
-    )
-    rejected_touches: dict[str, Count] = Field(
-        description="number of rejected touches by reason, for all sources together"
-    )
-    rejected_examples: dict[str, str] = Field(
-        default_factory=dict,
-        description="content and source of the newest rejected touch for each reason",
-    )
-    inputs: list[TouchInputStatus] = Field(
-        default_factory=list, description="configured touch inputs"
-    )
-    clicks_too_late: Count = Field(
-        0,
-        description="number of short vibrations that were too late to be felt; playback continues",
-    )
-    lost_events: dict[str, Count] = Field(
-        default={}, description="notifications that clients were too slow to read, by topic"
-    )
-    layout: str | None = Field(
-        None, description="name of the current layout; null if there is none"
-    )
-    layouts: list[str] = Field(default=[], description="names that `layout` accepts")
-    slow_reason: str | None = Field(
-        None, description="why table queries take longer than necessary; null if they do not"
-    )
-    threshold: str | None = Field(
-        None, description="name of the rig's threshold set, to which levels in dB SL are relative"
-    )
+    latency_ms: LatencySummary
+    """after a finger landed, moved or changed its pressure"""
+    lift_latency_ms: LatencySummary | None = None
+    """after a lift, or a change without a touch, such as the end of an effect"""
+    rejected_touches: dict[str, Count]
+    """number of rejected touches by reason, for all sources together"""
+    rejected_examples: dict[str, str] = Field(default_factory=dict)
+    """content and source of the newest rejected touch for each reason"""
+    inputs: list[TouchInputStatus] = Field(default_factory=list)
+    """configured touch inputs"""
+    clicks_too_late: Count = 0
+    """number of short vibrations that were too late to be felt; playback continues"""
+    lost_events: dict[str, Count] = Field({})
+    """notifications that clients were too slow to read, by topic"""
+    layout: str | None = None
+    """name of the current layout; null if there is none"""
+    layouts: list[str] = Field([])
+    """names that `layout` accepts"""
+    slow_reason: str | None = None
+    """why table queries take longer than necessary; null if they do not"""
+    threshold: str | None = None
+    """name of the rig's threshold set, to which levels in dB SL are relative"""
     uptime_s: float
 
 
@@ -170,24 +154,23 @@ class RequestedBy(ApiMessage):
 class DisarmParams(RequestedBy):
     """Whose lease to end."""
 
-    lease: Annotated[str, Field(min_length=1, max_length=80)] | None = Field(
-        None, description="disarm only if this lease is current; null: under any lease"
-    )
+    lease: Annotated[str, Field(min_length=1, max_length=80)] | None = None
+    """disarm only if this lease is current; null: under any lease"""
 
 
 class StopResult(ApiMessage):
     """Every amplifier is confirmed silent."""
 
     epoch: Epoch
-    amplifiers: dict[str, AmplifierSilence] = Field(default={}, description="by name")
+    amplifiers: dict[str, AmplifierSilence] = Field({})
+    """by name"""
 
 
 class ClearParams(RequestedBy):
     """The epoch up to which to acknowledge; a later stop, fault or loss stays latched."""
 
-    epoch: Epoch | None = Field(
-        None, description="as last received in a status, stop or state event; null: the current one"
-    )
+    epoch: Epoch | None = None
+    """as last received in a status, stop or state event; null: the current one"""
 
 
 class TouchParams(ApiMessage):
@@ -200,7 +183,8 @@ class TouchParams(ApiMessage):
 class LayoutParams(ApiMessage):
     """The layout to use."""
 
-    name: Name = Field(description="one of `layouts` in the status")
+    name: Name
+    """one of `layouts` in the status"""
 
 
 class LayoutResult(ApiMessage):
@@ -213,8 +197,10 @@ class LayoutResult(ApiMessage):
 class ReloadResult(ApiMessage):
     """Result of reading the daemon's files again."""
 
-    reloaded: bool = Field(description="whether the new files are in use; if not, nothing changed")
-    reasons: list[str] = Field(description="the changes, or the reasons for rejection")
+    reloaded: bool
+    """whether the new files are in use; if not, nothing changed"""
+    reasons: list[str]
+    """the changes, or the reasons for rejection"""
 
 
 class EffectsResult(ApiMessage):
@@ -230,32 +216,30 @@ _Points = Annotated[list[_Point], Field(max_length=MAX_GIVEN), FailFast()]
 class PlayParams(ApiMessage):
     """Play an effect, or points, at the finger nearest to a position; they end when it lifts."""
 
-    effect: Name | None = Field(
-        None, description="an effect of the layout or a built-in content; null with points or taps"
-    )
-    x_m: float = Field(description="a finger must be within 20 mm of the position")
+    effect: Name | None = None
+    """an effect of the layout or a built-in content; null with points or taps"""
+    x_m: float
+    """a finger must be within 20 mm of the position"""
     y_m: float
-    level_db_sl: float | None = Field(
-        None,
-        description="-20 or more. For an effect, default and maximum are its own level; for "
-        "points, the default is 20 and the maximum is the layout's `max_level_db_sl`",
-    )
-    points: _Points = Field(
-        [],
-        description="continuous event: `[time_s, intensity, sharpness]` in order of time; 0 to "
-        "60 s, 0 to 1, 0 to 1",
-    )
-    taps: _Points = Field([], description="transients, in the same format")
-    loop: bool = Field(False, description="whether points or a file repeat from the start")
+    level_db_sl: float | None = None
+    """-20 or more. For an effect, default and maximum are its own level; for points, the default is
+    20 and the maximum is the layout's `max_level_db_sl`"""
+    points: _Points = Field([])
+    """continuous event: `[time_s, intensity, sharpness]` in order of time; 0 to 60 s, 0 to 1, 0 to
+    1"""
+    taps: _Points = Field([])
+    """transients, in the same format"""
+    loop: bool = False
+    """whether points or a file repeat from the start"""
 
 
 class StrengthParams(ApiMessage):
     """A touch source, client or region and its gain; without a gain, nothing changes."""
 
-    name: SourceName = Field(description="name of an input, sender, source, client or region")
-    gain_db: Annotated[GainDb | None, BY_PLACE] = Field(
-        None, description="applied to all its effects; 0 is the level that layout and limits allow"
-    )
+    name: SourceName
+    """name of an input, sender, source, client or region"""
+    gain_db: Annotated[GainDb | None, BY_PLACE] = None
+    """applied to all its effects; 0 is the level that layout and limits allow"""
 
 
 class UnsubscribeParams(ApiMessage):
@@ -267,9 +251,8 @@ class UnsubscribeParams(ApiMessage):
 class SubscribeParams(UnsubscribeParams):
     """Topics to subscribe to, and the rate of the periodic ones."""
 
-    rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = Field(
-        None, description="rate of the periodic topics; default 10"
-    )
+    rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = None
+    """rate of the periodic topics; default 10"""
 
 
 class StateEvent(CauseAndRemedy):
@@ -277,10 +260,8 @@ class StateEvent(CauseAndRemedy):
 
     old: DaemonStateName
     new: DaemonStateName
-    word: str = Field(
-        default_factory=lambda known: STATE_WORDS[known["new"]],
-        description="the new state in plain words",
-    )
+    word: str = Field(default_factory=lambda known: STATE_WORDS[known["new"]])
+    """the new state in plain words"""
     epoch: Epoch
 
 
@@ -293,9 +274,8 @@ class ContactsEvent(ApiMessage):
 class PatternEvent(PatternFields):
     """A pattern that the amplifiers confirmed."""
 
-    latency_ms: float | None = Field(
-        description="from the touch to the last byte of the command; null if none was needed"
-    )
+    latency_ms: float | None
+    """from the touch to the last byte of the command; null if none was needed"""
 
 
 class SilenceEvent(ApiMessage):
@@ -303,7 +283,8 @@ class SilenceEvent(ApiMessage):
 
     contacts: list[ContactStatus]
     reason: str
-    latency_ms: float | None = Field(description="null if no command was needed")
+    latency_ms: float | None
+    """null if no command was needed"""
 
 
 class AmplifiersEvent(ApiMessage):
@@ -335,7 +316,8 @@ class LinkEvent(ApiMessage):
     """
 
     event: Literal["degraded", "restored", "lost", "retry", "reopened"]
-    amplifier: str | None = Field(description="name of the amplifier, if known")
+    amplifier: str | None
+    """name of the amplifier, if known"""
     message: str
     remedy: str | None
 
@@ -343,17 +325,19 @@ class LinkEvent(ApiMessage):
 class LayoutEvent(ApiMessage):
     """The layout was changed or replaced; its effects can differ."""
 
-    name: str | None = Field(None, description="name of the current layout; null if there is none")
-    layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
+    name: str | None = None
+    """name of the current layout; null if there is none"""
+    layout: dict[str, Any] | None
+    """the surface layout; null without one"""
 
 
 class InputsEvent(ApiMessage):
     """A touch input was opened, fell silent or was lost, or touches were rejected."""
 
-    inputs: list[TouchInputStatus] = Field(description="all configured inputs")
-    rejected_touches: dict[str, Count] = Field(
-        description="number of rejected touches by reason, for all sources together"
-    )
+    inputs: list[TouchInputStatus]
+    """all configured inputs"""
+    rejected_touches: dict[str, Count]
+    """number of rejected touches by reason, for all sources together"""
 
 
 class TopicData(NamedTuple):
@@ -397,10 +381,10 @@ class EventParams(ApiMessage):
     """Parameters of an `event` notification."""
 
     topic: Topic
-    time_s: float = Field(description="on CLOCK_MONOTONIC")
-    lost: Count = Field(
-        description="notifications dropped before this one because the client reads too slowly"
-    )
+    time_s: float
+    """on CLOCK_MONOTONIC"""
+    lost: Count
+    """notifications dropped before this one because the client reads too slowly"""
     data: dict[str, object]
 
 
@@ -423,29 +407,6 @@ class Method(NamedTuple):
     """Whether the method works without a persistent connection."""
 
 
-_HandlerT = TypeVar("_HandlerT", bound=Callable[..., Any])
-
-
-def api_method(**treatment: bool) -> Callable[[_HandlerT], _HandlerT]:
-    """Register a handler as an API method under its own name; treatment: fields of `Method`.
-
-    Its annotations define parameters and result; its docstring is the help text.
-    """
-
-    def register(handler: _HandlerT) -> _HandlerT:
-        kinds = get_type_hints(handler)
-        result = kinds["return"]
-        awaited = get_args(result)  # empty unless the result is awaitable
-        if awaited:
-            (result,) = awaited
-        vars(handler)["method"] = Method(kinds["params"], result, **treatment)
-        return handler
-
-    return register
-
-
-# begin: written by docs/generators/client_stub.py table
-
 METHODS: dict[str, Method] = {
     "hello": Method(HelloParams, HelloResult, in_reserve=True),
     "status": Method(Empty, StatusResult, in_reserve=True),
@@ -453,7 +414,9 @@ METHODS: dict[str, Method] = {
     "renew": Method(RenewParams, RenewResult),
     "disarm": Method(DisarmParams, Empty, is_limited=False, silences=True, in_reserve=True),
     "stop": Method(RequestedBy, StopResult, is_limited=False, silences=True, in_reserve=True),
+    # A repetition would acknowledge a stop that came meanwhile.
     "clear": Method(ClearParams, Empty, is_repeated=False),
+    # Only the newest frame counts, so frames never queue up.
     "touch": Method(TouchParams, Empty, is_limited=False),
     "layout": Method(LayoutParams, LayoutResult),
     "reload": Method(Empty, ReloadResult),
@@ -464,8 +427,6 @@ METHODS: dict[str, Method] = {
     "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
 }
 """Every method, by name."""
-
-# end
 
 SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)
 """Names of the methods that silence the plate."""

@@ -93,10 +93,32 @@ Epoch: TypeAlias = Annotated[
 ]
 
 
-class ApiMessage(BaseModel):
-    """Part of a message: no unknown keys, no implicit conversion, no NaN."""
+def _join_lines(schema: dict[str, Any]) -> None:
+    """Put each field's description in a JSON schema on one line."""
+    for field in schema.get("properties", {}).values():
+        if "description" in field:
+            field["description"] = one_line(field["description"])
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+def one_line(text: str) -> str:
+    """Return text of several lines on one line."""
+    return " ".join(text.split())
+
+
+class ApiMessage(BaseModel):
+    """Part of a message: no unknown keys, no implicit conversion, no NaN.
+
+    The text below a field is its description in the schema.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        frozen=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+        json_schema_extra=_join_lines,
+    )
 
 
 class Empty(ApiMessage):
@@ -106,8 +128,10 @@ class Empty(ApiMessage):
 class CauseAndRemedy(ApiMessage):
     """Cause of a state, and its remedy."""
 
-    cause: str = Field(description="cause of the state")
-    remedy: str | None = Field(description="remedy; null if no action is needed")
+    cause: str
+    """cause of the state"""
+    remedy: str | None
+    """remedy; null if no action is needed"""
 
 
 class EraPosition(ApiMessage):
@@ -126,15 +150,19 @@ class RigSummary(ApiMessage):
     length_m: float
     width_m: float
     eras: list[EraPosition]
-    simulated: bool = Field(description="whether any of its amplifiers is simulated")
-    frequency_hz: list[float] = Field(description="lowest and highest allowed by the rig")
+    simulated: bool
+    """whether any of its amplifiers is simulated"""
+    frequency_hz: list[float]
+    """lowest and highest allowed by the rig"""
 
 
 class TableSummary(ApiMessage):
     """The current localization table."""
 
-    fingerprint: str = Field(description="identifies the plate and ERAs it was built for")
-    mode: str = Field(description="switched or phased")
+    fingerprint: str
+    """identifies the plate and ERAs it was built for"""
+    mode: str
+    """switched or phased"""
     frequencies_hz: list[float]
     cells_x: Count
     cells_y: Count
@@ -143,14 +171,14 @@ class TableSummary(ApiMessage):
 class TouchPoint(ApiMessage):
     """One finger of a touch frame."""
 
-    id: Annotated[int, Field(ge=-(2**31), lt=2**31)] = Field(
-        description="chosen by the client, constant from touch-down to lift"
-    )
-    x_m: float = Field(description="from the plate's south-west corner")
-    y_m: float = Field(description="from the plate's south-west corner, upwards")
-    radius_m: float | None = Field(
-        None, description="radius of the contact, if known; 12.5 mm or more is a resting hand"
-    )
+    id: Annotated[int, Field(ge=-(2**31), lt=2**31)]
+    """chosen by the client, constant from touch-down to lift"""
+    x_m: float
+    """from the plate's south-west corner"""
+    y_m: float
+    """from the plate's south-west corner, upwards"""
+    radius_m: float | None = None
+    """radius of the contact, if known; 12.5 mm or more is a resting hand"""
 
 
 class TouchInputStatus(ApiMessage):
@@ -158,13 +186,11 @@ class TouchInputStatus(ApiMessage):
 
     name: str
     url: str
-    state: Literal["open", "mute", "missing", "ended"] = Field(
-        description="mute: open, but silent although it should send; missing: not opened, or lost, "
-        "and being retried; ended: a recording at its end"
-    )
-    problem: str | None = Field(
-        None, description="why it is mute or missing, and what to do; null if it is neither"
-    )
+    state: Literal["open", "mute", "missing", "ended"]
+    """mute: open, but silent although it should send; missing: not opened, or lost, and being
+    retried; ended: a recording at its end"""
+    problem: str | None = None
+    """why it is mute or missing, and what to do; null if it is neither"""
 
 
 class ContactStatus(ApiMessage):
@@ -174,93 +200,66 @@ class ContactStatus(ApiMessage):
     id: int
     x_m: float
     y_m: float
-    role: Literal["target", "quiet", "hand", "surplus"] | None = Field(
-        None,
-        description="target: feels the pattern; quiet: kept quiet; hand: a resting hand, and "
-        "surplus: a finger beyond max_fingers, which count only as loads; null before the first "
-        "decision",
-    )
-    level_db_sl: float | None = Field(
-        None,
-        description="predicted level of a target relative to the rig's threshold set (`threshold` "
-        "of `status`); null if unknown",
-    )
+    role: Literal["target", "quiet", "hand", "surplus"] | None = None
+    """target: feels the pattern; quiet: kept quiet; hand: a resting hand, and surplus: a finger
+    beyond max_fingers, which count only as loads; null before the first decision"""
+    level_db_sl: float | None = None
+    """predicted level of a target relative to the rig's threshold set (`threshold` of `status`);
+    null if unknown"""
     promised_contrast_db: float | None = Field(None, description=PROMISED)
-    contrast_db: float | None = Field(
-        None,
-        description="predicted felt contrast, target over loudest quiet finger; null for a single "
-        "finger",
-    )
-    effect: str | None = Field(None, description="the effect selected for it, if any")
-    feels: str | None = Field(
-        None, description="the effect that the finger feels: its own, or another finger's"
-    )
-    verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
-        None,
-        description="how a target feels its vibration. own: separately; mixed: together with other "
-        "vibrations (promised contrast below 12 dB, or others are felt during its "
-        "pauses); shared: it feels another finger's vibration instead; held back: not "
-        "at all",
-    )
-    frequency_hz: float | None = Field(
-        None,
-        description="requested frequency of its vibration, before rounding; null if it has "
-        "several frequencies",
-    )
-    foreign_level_db_sl: float | None = Field(
-        None,
-        description="crosstalk level of others' vibrations here, not exceeded on 90 % of "
-        "plates, relative to the most sensitive published thresholds (not comparable with "
-        "level_db_sl); null if there are no other vibrations",
-    )
-    rig_foreign_level_db_sl: float | None = Field(
-        None,
-        description="the same level relative to the rig's threshold set, like level_db_sl",
-    )
-    is_foreign_felt: bool = Field(
-        False,
-        description="whether other vibrations can be felt here (foreign_level_db_sl above 0); "
-        "with verdict own they are at least 12 dB weaker",
-    )
-    leak_db_sl: float | None = Field(
-        None,
-        description="crosstalk level at the finger's current position on the nominal plate, "
-        "relative to the rig's threshold set; can exceed the promise while the "
-        "finger moves; sent only in the status; null if there are no other vibrations",
-    )
-    held_back: str | None = Field(
-        None,
-        description="why its own effect, or a click over its continuous effect, is not played; "
-        "null if it is",
-    )
-    load: float = Field(
-        1.0,
-        description="load on the plate relative to the rig's fingertip; 1 if not reported",
-    )
+    contrast_db: float | None = None
+    """predicted felt contrast, target over loudest quiet finger; null for a single finger"""
+    effect: str | None = None
+    """the effect selected for it, if any"""
+    feels: str | None = None
+    """the effect that the finger feels: its own, or another finger's"""
+    verdict: Literal["own", "mixed", "shared", "held back"] | None = None
+    """how a target feels its vibration. own: separately; mixed: together with other vibrations
+    (promised contrast below 12 dB, or others are felt during its pauses); shared: it feels another
+    finger's vibration instead; held back: not at all"""
+    frequency_hz: float | None = None
+    """requested frequency of its vibration, before rounding; null if it has several frequencies"""
+    foreign_level_db_sl: float | None = None
+    """crosstalk level of others' vibrations here, not exceeded on 90 % of plates, relative to the
+    most sensitive published thresholds (not comparable with level_db_sl); null if there are no
+    other vibrations"""
+    rig_foreign_level_db_sl: float | None = None
+    """the same level relative to the rig's threshold set, like level_db_sl"""
+    is_foreign_felt: bool = False
+    """whether other vibrations can be felt here (foreign_level_db_sl above 0); with verdict own
+    they are at least 12 dB weaker"""
+    leak_db_sl: float | None = None
+    """crosstalk level at the finger's current position on the nominal plate, relative to the rig's
+    threshold set; can exceed the promise while the finger moves; sent only in the status; null if
+    there are no other vibrations"""
+    held_back: str | None = None
+    """why its own effect, or a click over its continuous effect, is not played; null if it is"""
+    load: float = 1.0
+    """load on the plate relative to the rig's fingertip; 1 if not reported"""
 
 
 class PlayedTone(ApiMessage):
     """An ERA's tone, confirmed by the amplifier."""
 
     frequency_hz: float
-    level: float = Field(description="0 to 1 of the full stroke")
+    level: float
+    """0 to 1 of the full stroke"""
     phase_deg: float
 
 
 class PatternFields(ApiMessage):
     """The contacts, and the tones played for them."""
 
-    contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
-    drive: dict[str, PlayedTone] = Field(
-        description="tones of the newest vibration by ERA; silent ERAs are omitted"
-    )
-    layers: dict[str, dict[str, PlayedTone]] = Field(
-        default_factory=dict,
-        description="tones of each vibration by layer, then by ERA, in the format of `drive`; "
-        "an ERA plays the sum of its layers",
-    )
+    contacts: list[ContactStatus]
+    """in order of arrival, newest last"""
+    drive: dict[str, PlayedTone]
+    """tones of the newest vibration by ERA; silent ERAs are omitted"""
+    layers: dict[str, dict[str, PlayedTone]] = Field(default_factory=dict)
+    """tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA plays the sum
+    of its layers"""
     promised_contrast_db: float | None = Field(None, description=PROMISED)
-    predicted_contrast_db: float | None = Field(None, description="the same on the nominal plate")
+    predicted_contrast_db: float | None = None
+    """the same on the nominal plate"""
     predicted_level_db_sl: float | None
 
 
@@ -269,28 +268,27 @@ class LinkCounters(ApiMessage):
 
     frames_out: Count
     frames_in: Count
-    invalid_frames: Count = Field(
-        description="frames with a wrong checksum, length, format or version"
-    )
-    unexpected_frames: Count = Field(description="valid but unexpected frames")
+    invalid_frames: Count
+    """frames with a wrong checksum, length, format or version"""
+    unexpected_frames: Count
+    """valid but unexpected frames"""
     events: Count
     retries: Count
     timeouts: Count
     refusals: Count
-    round_trip_ms: float | None = Field(description="of the last request")
+    round_trip_ms: float | None
+    """of the last request"""
 
 
 class AmplifierSilence(ApiMessage):
     """Whether an amplifier is silent, after a stop or while it does not reply."""
 
-    silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
-        description="confirmed_silent: confirmed by a status after the stop; watchdog_elapsed: "
-        "unconfirmed, but the watchdog should have silenced it by now"
-    )
-    may_play_for_s: float | None = Field(
-        description="time until its watchdog should have silenced it; null if its watchdog is "
-        "unknown or silence is confirmed"
-    )
+    silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"]
+    """confirmed_silent: confirmed by a status after the stop; watchdog_elapsed: unconfirmed, but
+    the watchdog should have silenced it by now"""
+    may_play_for_s: float | None
+    """time until its watchdog should have silenced it; null if its watchdog is unknown or silence
+    is confirmed"""
     cause: str
 
     @property
@@ -318,43 +316,37 @@ class AmplifierStatus(ApiMessage):
     name: str
     url: str
     serial_number: str | None
-    state: str | None = Field(description="CiA 402 name of the amplifier's own state")
-    word: str | None = Field(
-        default_factory=lambda known: STATE_WORDS.get(known["state"]),
-        description="the state in plain words",
-    )
+    state: str | None
+    """CiA 402 name of the amplifier's own state"""
+    word: str | None = Field(default_factory=lambda known: STATE_WORDS.get(known["state"]))
+    """the state in plain words"""
     fault: str | None
-    levels: list[float] = Field(
-        description="reported level of each channel, 0 to 1 of the full stroke; empty if unknown"
-    )
+    levels: list[float]
+    """reported level of each channel, 0 to 1 of the full stroke; empty if unknown"""
     high_voltage: bool | None
-    reply_age_s: float | None = Field(description="time since its last reply")
-    clock_skew_us: float | None = Field(
-        None,
-        description="RMS error of its clock relative to the others, estimated by the host; null "
-        "for a single or unsynchronized amplifier",
-    )
-    degraded: bool = Field(
-        False,
-        description="whether the amplifier does not reply but may still play; no new vibration "
-        "starts "
-        "meanwhile",
-    )
-    lost: bool = Field(description="whether the link to it is lost")
-    closed_with_lost: bool = Field(
-        description="whether its link was closed, although it replied, because another amplifier "
-        "is lost"
-    )
-    reports: list[AmplifierReport] = Field([], description="reports from the last 10 s")
-    silence: AmplifierSilence | None = Field(
-        None, description="while it does not reply: whether it is silent; null while it replies"
-    )
+    reply_age_s: float | None
+    """time since its last reply"""
+    clock_skew_us: float | None = None
+    """RMS error of its clock relative to the others, estimated by the host; null for a single or
+    unsynchronized amplifier"""
+    degraded: bool = False
+    """whether the amplifier does not reply but may still play; no new vibration starts meanwhile"""
+    lost: bool
+    """whether the link to it is lost"""
+    closed_with_lost: bool
+    """whether its link was closed, although it replied, because another amplifier is lost"""
+    reports: list[AmplifierReport] = Field([])
+    """reports from the last 10 s"""
+    silence: AmplifierSilence | None = None
+    """while it does not reply: whether it is silent; null while it replies"""
     statistics: LinkCounters
 
     # begin: written by docs/generators/client_stub.py readings
 
-    temperature_c: float | None = Field(description="of the amplifier")
-    high_voltage_v: float | None = Field(description="of the supply; 0: not measured")
+    temperature_c: float | None
+    """of the amplifier"""
+    high_voltage_v: float | None
+    """of the supply; 0: not measured"""
 
     # end
 
@@ -369,10 +361,9 @@ class LatencySummary(ApiMessage):
     median: float | None
     p99: float | None
     p999: float | None
-    histogram: list[tuple[float, int]] = Field(
-        description="[upper edge in ms, number above the previous edge and up to this one]; "
-        "values above the last edge are counted in the last"
-    )
+    histogram: list[tuple[float, int]]
+    """[upper edge in ms, number above the previous edge and up to this one]; values above the last
+    edge are counted in the last"""
 
 
 class EffectDescription(ApiMessage):
@@ -381,6 +372,5 @@ class EffectDescription(ApiMessage):
     name: str
     kind: str
     description: str
-    parameters: dict[str, Any] = Field(
-        description="parameters by name in a layout file, in SI units"
-    )
+    parameters: dict[str, Any]
+    """parameters by name in a layout file, in SI units"""

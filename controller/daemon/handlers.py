@@ -34,7 +34,6 @@ from controller.api.methods import (
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
-    api_method,
 )
 from controller.api.schema import AmplifierSilence, Empty, TouchPoint, headline
 from controller.api.server import Connection, Handler
@@ -123,7 +122,6 @@ class ApiService:
         lease = self._supervisor.operation.lease_at(threads.now())
         return lease is not None and client.lease == lease.token
 
-    @api_method(in_reserve=True)
     def hello(self, client: Connection, params: HelloParams) -> HelloResult:
         """Introduce the client; returns the daemon's rig, table and layout."""
         client.name = params.client
@@ -139,7 +137,6 @@ class ApiService:
             layout=self._layouts.event().layout,
         )
 
-    @api_method(in_reserve=True)
     def status(self, client: Connection, params: Empty) -> StatusResult:
         """Show the state of the daemon, the amplifiers and the contacts."""
         now = threads.now()
@@ -179,7 +176,6 @@ class ApiService:
             uptime_s=now - self._started,
         )
 
-    @api_method(needs_reply=True, is_repeated=False)
     async def arm(self, client: Connection, params: ArmParams) -> ArmResult:
         """Switch the high voltage on. Touches are felt until the lease expires."""
         if self._supervisor.operation.is_lease_over(threads.now()):  # current playback ends
@@ -204,7 +200,6 @@ class ApiService:
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
-    @api_method()
     def renew(self, client: Connection, params: RenewParams) -> RenewResult:
         """Extend the lease."""
         lease = check_lease(self._supervisor.operation.lease, params.lease, threads.now())
@@ -212,7 +207,6 @@ class ApiService:
         client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
 
-    @api_method(is_limited=False, silences=True, in_reserve=True)
     async def disarm(self, client: Connection, params: DisarmParams) -> Empty:
         """Ramp to silence, then switch the high voltage off.
 
@@ -229,7 +223,6 @@ class ApiService:
             raise _wrong_state(operation)
         return Empty()
 
-    @api_method(is_limited=False, silences=True, in_reserve=True)
     def stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
         """Quick-stop all amplifiers. The stop is latched until `clear`.
 
@@ -241,7 +234,6 @@ class ApiService:
         stopping = self._supervisor.stop(cause, "clear (era clear), then arm again")
         return _silence(stopping, self._supervisor.operation.epoch)
 
-    @api_method(is_repeated=False)  # a repetition would acknowledge a stop that came meanwhile
     async def clear(self, client: Connection, params: ClearParams) -> Empty:
         """Clear a stop, or a fault that no longer exists. The plate stays disarmed."""
         operation = self._supervisor.operation
@@ -263,7 +255,6 @@ class ApiService:
             raise _wrong_state(operation)
         return Empty()
 
-    @api_method(is_limited=False)  # the newest frame counts, so they never queue up
     def touch(self, client: Connection, params: TouchParams) -> Empty:
         """Report all fingers of a touch source."""
         if client.number is None:
@@ -278,7 +269,6 @@ class ApiService:
         self._controller.cycle.deliver(frame)
         return Empty()
 
-    @api_method()
     def layout(self, client: Connection, params: LayoutParams) -> LayoutResult:
         """Switch to another of the daemon's layouts.
 
@@ -288,7 +278,6 @@ class ApiService:
         self._layouts.use(params.name)
         return LayoutResult(layout=params.name, layouts=self._layouts.names)
 
-    @api_method()
     def reload(self, client: Connection, params: Empty) -> Awaitable[ReloadResult]:
         """Read the daemon's files again and apply their layouts.
 
@@ -296,12 +285,10 @@ class ApiService:
         """
         return self._reload()
 
-    @api_method()
     def effects(self, client: Connection, params: Empty) -> EffectsResult:
         """List the available effects."""
         return effects_result(self._layouts.player.layout)
 
-    @api_method(is_repeated=False)
     async def play(self, client: Connection, params: PlayParams) -> Empty:
         """Play an effect, or points and taps, at a finger; only while armed."""
         # At the contact nearest to the position, at most at the effect's own level.
@@ -365,7 +352,6 @@ class ApiService:
             raise RpcError(ErrorCode.REFUSED, nearest.why_load_alone, where="x_m")
         return nearest
 
-    @api_method()
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
         """Set or show the strength of a source, client or region.
 
@@ -408,7 +394,6 @@ class ApiService:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._saving, _SAVE_TIMEOUT)
 
-    @api_method(over_http=False)
     def subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
         """Subscribe to notifications of topics."""
         # After the reply, so that no event precedes it.
@@ -419,7 +404,6 @@ class ApiService:
         if client.is_open:
             self._publisher.hub.subscribe(client, params.topics, rate=params.rate_hz)
 
-    @api_method(over_http=False)
     def unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
         """Unsubscribe from notifications of topics."""
         self._publisher.hub.unsubscribe(client, params.topics)

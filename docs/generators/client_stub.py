@@ -1,6 +1,7 @@
-"""Parts of `controller/api` that follow from where methods are handled and readings are defined.
+"""Parts of `controller/api` that are written from the table of methods, handlers and readings.
 
-Methods are registered in `controller/daemon/handlers.py`, which clients and gateway do not load.
+The docstrings of the handlers in `controller/daemon/handlers.py` are the summaries: clients and
+gateway do not load that module.
 """
 
 import textwrap
@@ -8,8 +9,8 @@ import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Union, get_args, get_origin
 
-from controller.api.methods import BY_PLACE, Method
-from controller.api.schema import Empty
+from controller.api.methods import BY_PLACE, METHODS, Method
+from controller.api.schema import Empty, one_line
 from controller.daemon.handlers import ApiService
 from drivers.protocol.definition import READINGS
 
@@ -17,30 +18,17 @@ _WIDTH = 100  # of a line, as ruff has it
 _BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
 """Methods of `AsyncClient` that put parameters together from positions and names of topics."""
 
+_CONSTANTS = ("DEFAULT_LEASE", "METHODS", "SILENCING")
+"""Names other than results that client.py imports from methods.py."""
+
 
 def registered() -> dict[str, tuple[Method, str]]:
-    """The methods that the daemon handles, by name, with what each does."""
-    return {
-        name: (handler.method, " ".join((handler.__doc__ or "").split()))
-        for name, handler in vars(ApiService).items()
-        if hasattr(handler, "method")
-    }
-
-
-def _table() -> str:
-    """The table of all methods, in methods.py."""
-    rows = [f'    "{name}": {_call(method)},' for name, (method, _) in registered().items()]
-    return "\n".join(["METHODS: dict[str, Method] = {", *rows, "}", '"""Every method, by name."""'])
-
-
-def _call(method: Method) -> str:
-    """A registration as Python."""
-    changed = [
-        f"{key}={value}"
-        for key, default in Method._field_defaults.items()
-        if (value := getattr(method, key)) != default
-    ]
-    return f"Method({', '.join([method.params.__name__, method.result.__name__, *changed])})"
+    """All methods by name, with the docstring of the handler on one line."""
+    methods = {}
+    for name, method in METHODS.items():
+        docstring = getattr(ApiService, name).__doc__ or ""
+        methods[name] = method, one_line(docstring)
+    return methods
 
 
 def summaries() -> str:
@@ -63,13 +51,23 @@ def summaries() -> str:
 def _readings() -> str:
     """The fields of an amplifier's status that are readings of the protocol, in schema.py."""
     lines = []
-    for each in READINGS:
-        default = "None, " if each.is_added else ""
-        meaning = each.meaning + "; null where the amplifier does not state it" * each.is_added
-        line = f'    {each.key}: float | None = Field({default}description="{meaning}")'
-        if len(line) > _WIDTH:
-            line = line.replace("Field(", "Field(\n        ")[:-1] + "\n    )"
-        lines.append(line)
+    for reading in READINGS:
+        default = " = None" if reading.is_added else ""
+        meaning = reading.meaning
+        if reading.is_added:
+            meaning += "; null where the amplifier does not state it"
+        lines.append(f"    {reading.key}: float | None{default}")
+        lines += textwrap.wrap(
+            f'"""{meaning}"""', _WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 4
+        )
+    return "\n".join(lines)
+
+
+def _results() -> str:
+    """The import of everything that client.py needs of methods.py."""
+    classes = {method.result.__name__ for method in METHODS.values()} - {"Empty"}
+    names = [*_CONSTANTS, *sorted(classes)]
+    lines = ["from controller.api.methods import (", *(f"    {name}," for name in names), ")"]
     return "\n".join(lines)
 
 
@@ -136,8 +134,7 @@ def _blocking() -> str:
 
 
 PARTS: Mapping[str, Mapping[str, Callable[[], str]]] = {
-    "methods": {"table": _table},
     "schema": {"readings": _readings},
-    "client": {"methods": _methods, "blocking": _blocking},
+    "client": {"results": _results, "methods": _methods, "blocking": _blocking},
 }
 """The writers of a module of `controller/api`, by module and name of the part."""

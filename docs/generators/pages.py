@@ -61,7 +61,9 @@ def insert(page: str, text: str, *, name: str) -> str:
     found = re.fullmatch(f"(.*{marks[0]}).*?({marks[1]}.*)", page, re.DOTALL)
     if found is None:
         raise ValueError(f"the page has no lines {begin} and {END}")
-    return f"{found[1]}\n{text.rstrip()}\n\n{found[2]}"
+    # Imports follow the mark without a blank line.
+    gap = "" if text.startswith("from ") else "\n"
+    return f"{found[1]}{gap}{text.rstrip()}\n\n{found[2]}"
 
 
 def _parts(writer: str, parts: Mapping[str, Callable[[], str]]) -> list[Writer]:

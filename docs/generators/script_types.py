@@ -8,6 +8,7 @@ from typing import Any
 
 from client_stub import registered
 from controller.api.methods import TOPICS
+from controller.api.schema import one_line
 from message_types import Models, Notation, each_model
 
 _ROOT = Path(__file__).parents[2]
@@ -63,7 +64,7 @@ def _interface(name: str, summary: str) -> Iterator[str]:
 def _fields(name: str, models: Models) -> Iterator[str]:
     for key, field in models[name].model_fields.items():
         if field.description:
-            yield f"  /** {field.description} */"
+            yield f"  /** {one_line(field.description)} */"
         optional = "" if field.is_required() else "?"
         yield f"  {key}{optional}: {_TYPES.type_of(field.rebuild_annotation(), models)};"
 

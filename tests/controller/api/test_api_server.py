@@ -48,6 +48,7 @@ from controller.api.methods import (
 from controller.api.schema import MAX_RATE, ApiMessage, Empty
 from controller.api.server import MAX_UNREAD_BYTES, ApiServer, Connection
 from controller.gateway.field import DrawnField
+from kit.api_parameters import API_PARAMETERS
 from kit.clock import feed, in_virtual_time
 from kit.courses import Taken, courses, follow
 from processes.daemons import (
@@ -64,12 +65,9 @@ from processes.daemons import (
 from registry import threads
 
 PARAMS = {
-    "arm": '{"owner":"me","lease_s":5}',
+    **{name: json.dumps(API_PARAMETERS[name]) for name in ("arm", "hello", "play", "renew")},
     "disarm level": '{"level":2}',
     "effects x": '{"x":1}',
-    "hello": '{"client":"a"}',
-    "play": '{"effect":"x","x_m":0,"y_m":0}',
-    "renew": '{"lease":"a"}',
     "renew stop": '{"lease":"stop"}',
     "stop x": '{"x":1}',
     "touch": '{"source":"a","touches":[]}',

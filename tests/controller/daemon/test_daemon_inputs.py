@@ -18,6 +18,7 @@ import types
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ import pytest
 
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
+from controller.api.link import make_params
 from controller.api.methods import METHODS, TOPICS, InputsEvent
 from controller.cli.status_text import show_status
 from controller.daemon.config import TouchInput
@@ -38,6 +40,7 @@ from controller.sources import udp_source
 from controller.sources.touch import Change, RejectCounter, Touch, TouchFrame, TouchSource
 from controller.sources.touch_calibration import TouchCalibration, turned
 from examples.make_touches import tuio_datagram
+from kit.api_parameters import API_PARAMETERS
 from kit.clock import MemoryMachine, VirtualLoop, in_virtual_time
 from kit.fingers import bundle, frame, free_port, message, panel
 from kit.host_rules import tell_first
@@ -511,9 +514,10 @@ def calls(
         await era.disarm()
         await era.renew((await era.arm("me", lease_s=60)).lease)
 
-    return {
-        "hello": lambda: era.hello("me"),
-        "status": era.status,
+    async def request(name: str) -> None:
+        await era.request(name, make_params(name, **API_PARAMETERS[name]))
+
+    return {name: partial(request, name) for name in API_PARAMETERS} | {
         "arm": lambda: era.arm("another", lease_s=60),
         "renew": renew,
         "disarm": lambda: again("disarm"),
@@ -522,7 +526,6 @@ def calls(
         "touch": touch,
         "layout": lambda: era.layout(("two", "one")[next(numbers) % 2]),
         "reload": reload,
-        "effects": era.effects,
         "play": play,
         "strength": strength,
         "subscribe": lambda: era.subscribe(*TOPICS, rate_hz=60),

@@ -261,13 +261,17 @@ def step(since: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Case:
-    """An effect and over which part of it [s] its level is felt, and the way of the finger."""
+    """An effect, the part of its first vibration [s] that is measured, and the finger's path.
+
+    vibrations: number of separate vibrations that a press causes.
+    """
 
     effect: Effect
     duration: float
     since: float = 0.0
     way: Way = rest
     held: float = 0.15
+    vibrations: int = 1
 
 
 CASES = {
@@ -293,7 +297,9 @@ def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: st
     layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
     chain = Pressed(smooth_rig(), table(), layout, wire)
     ways = [case.way] * PRESSES.get(wire, FEW)
-    presses = [felt for (felt,) in chain.press(*ways, held=case.held)]
+    vibrations = chain.press(*ways, held=case.held)
+    assert [len(of_press) for of_press in vibrations] == [case.vibrations] * len(ways)
+    presses = [of_press[0] for of_press in vibrations]
     levels = [felt.level_db_sl(case.duration, since=case.since) for felt in presses]
     assert levels == pytest.approx([case.effect.level] * len(ways), abs=3.0)
     if name != "ramp":  # which reports each of its steps

@@ -2,8 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence, Set
 
-from controller.play.intent import Content
-from controller.play.selection import PendingChoice
+from controller.play.intent import Content, Question
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import ContactKey
 
@@ -20,8 +19,8 @@ class WaitingChanges:
 
     refused: ChangeTimes
     """Changes of a plan that amplifiers refused."""
-    _choice: PendingChoice | None
-    """The choice in the thread that `_for_choice` wait for."""
+    _choice: Question | None
+    """The question in the thread whose choice `_for_choice` wait for."""
     _for_choice: ChangeTimes
     """Changes that the choice will respond to."""
 
@@ -31,10 +30,10 @@ class WaitingChanges:
         self._choice = None
         self._for_choice = {}
 
-    def answered_by(self, started: Sequence[Content], choice: PendingChoice | None) -> ChangeTimes:
+    def answered_by(self, started: Sequence[Content], choice: Question | None) -> ChangeTimes:
         """Return the changes that a plan responds to; they no longer wait.
 
-        started: contents that the plan starts; choice: the choice in the thread. During a choice
+        started: contents that the plan starts; choice: the question in the thread. During a choice
         the plan responds only to lifts and to fingers whose pulses start. A lasting content that
         starts comes from the previous choice, and responds to the changes that waited for it.
         """

@@ -1,4 +1,4 @@
-"""Chooser: choose the contents that answer a question, from a table.
+"""Chooser: choose the contents that answer a question, from a table, in a thread if necessary.
 
 All lasting contents are chosen together by one answer of the table. Each short pulse is chosen
 alone, with the stroke and the power that the lasting contents leave: all other fingers are quiet,
@@ -7,12 +7,17 @@ of its own finger continues. While a pulse plays, lasting contents are confined 
 power that it leaves.
 """
 
+import asyncio
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum, auto
+from functools import partial
+from typing import TypeAlias
 
 from controller.play.crossfades import Crossfades
 from controller.play.intent import (
+    TIME_LIMIT,
     Content,
     ContentKey,
     FingerTarget,
@@ -34,6 +39,7 @@ from model.arrays import NEARLY
 from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text
+from registry.threads import DaemonThreads
 
 _USED_UP = "the vibrations of other fingers use the whole stroke; lift a finger"
 
@@ -172,6 +178,90 @@ class Chooser:
         """Return the contents for lasting targets, in phase with the contents that play."""
         solution = answered(self.table, question, targets, capabilities, now=question.now)
         return selection_of(self.table, question, solution, targets, shape=self.shape)
+
+
+_Future: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
+
+
+class ChoicePhase(Enum):
+    """The progress of a choice in the thread."""
+
+    IDLE = auto()
+    """The thread has no question."""
+    COMPUTING = auto()
+    """The thread works on a question."""
+    DONE = auto()
+    """The thread has chosen; the choice has not been taken yet."""
+    OVERDUE = auto()
+    """The thread works on a question after the time limit; silence has not been taken yet."""
+    GIVEN_UP = auto()
+    """Silence has been taken, but the thread still works; its choice will be dropped."""
+
+
+class ChoiceThread:
+    """Makes one choice at a time in a thread, and gives it up after a second.
+
+    The thread cannot be ended while it works, so no other choice begins before. arrived: called
+    when a choice can be taken, and when a choice that was given up has ended.
+    """
+
+    def __init__(self, arrived: Callable[[], None]) -> None:
+        self._arrived = arrived
+        self._threads = DaemonThreads()
+        self._phase = ChoicePhase.IDLE
+        self._future: _Future | None = None
+        self.pending: Question | None = None
+        """The question whose selections have not been taken yet; None without any."""
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether the thread still works on a choice that was given up."""
+        return self._phase is ChoicePhase.GIVEN_UP
+
+    def start(
+        self, chooser: Chooser, question: Question, capabilities: PlaybackCapabilities
+    ) -> None:
+        """Start a choice in the thread, which must be idle; RuntimeError if it cannot start."""
+        loop = asyncio.get_running_loop()
+        choose = partial(chooser.choose, question, capabilities)
+        future = loop.run_in_executor(self._threads, choose)
+        self._future = future
+        self._phase = ChoicePhase.COMPUTING
+        self.pending = question
+        future.add_done_callback(self._note_done)
+        loop.call_later(TIME_LIMIT, self._note_time_limit, future)
+
+    def take(self) -> tuple[Selection, ...] | None:
+        """Return the selections for the pending question, once; None before they are chosen.
+
+        A choice that takes too long is given up: its targets are silent.
+        """
+        question = self.pending
+        if self._phase is ChoicePhase.DONE and self._future is not None:
+            self._phase = ChoicePhase.IDLE
+            self.pending = None
+            return self._future.result()
+        if self._phase is ChoicePhase.OVERDUE and question is not None:
+            self._phase = ChoicePhase.GIVEN_UP
+            self.pending = None
+            return question.given_up()
+        return None
+
+    def _note_time_limit(self, future: _Future) -> None:
+        """Note that the time limit of a choice has passed, unless it is done."""
+        if not future.done():
+            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+            self._phase = ChoicePhase.OVERDUE
+            self._arrived()
+
+    def _note_done(self, future: _Future) -> None:
+        """Note that the thread has ended a choice."""
+        if self._phase is ChoicePhase.GIVEN_UP:
+            self._phase = ChoicePhase.IDLE
+            future.exception()  # retrieved, so that asyncio does not log it
+        else:
+            self._phase = ChoicePhase.DONE
+        self._arrived()
 
 
 def _is_level_change(targets: Targets, playing: Mapping[ContentKey, Content]) -> bool:

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.play.intent import Content, Question, Selection
+from controller.play.intent import FADED_AFTER, NOTHING, Content, Question, Selection
 from controller.play.joint_answers import SHORT_OF, Shape, answered, selection_of
 from controller.play.shared_capabilities import PlaybackCapabilities
+from controller.play.slot import CROSSFADE, FALL_AFTER
 from controller.sources.touch import ContactKey
 from model.answer.answer import APART_HZ, SAME_LEVEL, Answer
 from model.answer.plan import worst_of
@@ -32,10 +33,96 @@ WORTH = 2.0
 WORTH_OF_WEIGHTS = 0.5
 """Gain in promised contrast [dB] of the worst finger that justifies other weights alone."""
 
+RESTS_AFTER = 0.1
+"""Fingers rest if no finger has come, left or moved further for this time [s]."""
+
+CROSSFADE_INTERVAL = 0.4
+"""Time [s] between two steps to a better answer, each of another finger."""
+
+MIN_INTERVAL = 1.0
+"""Time [s] from the last step to one answer to the first step to the next answer."""
+
+_FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; contents that a step replaces
+
 _SAME = 0.01  # difference between two drives that is not felt, relative to the largest amplitude
 
 _Voices = Mapping[ContactKey, tuple[Content, ...]]
 """A content and its side bands, by the finger that owns it."""
+
+
+def is_due(date: float, now: float) -> bool:
+    """Whether a date [s] has come; an infinite date never comes."""
+    return date <= now and date < math.inf
+
+
+class Improvement:
+    """The steps from the present contents to a better answer, and when to look for one [s]."""
+
+    def __init__(self) -> None:
+        self.rests_at = math.inf
+        """When the fingers will have rested, so that a better answer can be looked for."""
+        self.next_step_at = math.inf
+        """When the next step is due."""
+        self._steps: Sequence[Selection] = ()
+        """The selections after each remaining step."""
+        self._stepped_at = -math.inf
+        """When the last step changed contents."""
+        self._fading = NOTHING
+        """The contents that this step replaced."""
+
+    @property
+    def due(self) -> float:
+        """When the next step or the search for a better answer is due."""
+        return min(self.rests_at, self.next_step_at)
+
+    @property
+    def next_step(self) -> Selection | None:
+        """The selection after the next step; None if no step remains."""
+        return self._steps[0] if self._steps else None
+
+    def fading_at(self, now: float) -> Selection:
+        """Return the contents that the last step replaced, until they have faded."""
+        if now < self._stepped_at + _FADES_FOR:
+            return self._fading
+        return NOTHING
+
+    def stop(self) -> None:
+        """Drop the remaining steps, and do not look for a better answer."""
+        self._steps = ()
+        self.next_step_at = math.inf
+        self.rests_at = math.inf
+
+    def wait_for_rest(self, now: float) -> None:
+        """Drop the remaining steps, and look for a better answer when fingers have rested."""
+        self.stop()
+        self.rests_at = max(now + RESTS_AFTER, self._stepped_at + MIN_INTERVAL)
+
+    def start(self, steps: Sequence[Selection], now: float) -> None:
+        """Start the steps to a better answer."""
+        self._steps = steps
+        self.next_step_at = now
+        self.rests_at = math.inf
+
+    def take_step(self, present: Selection, now: float) -> None:
+        """Note that the next step is taken from the present selection."""
+        step, *self._steps = self._steps
+        if step.contents != present.contents:
+            self._fading = _replaced_contents(present, step)
+            self._stepped_at = now
+        self.next_step_at = math.inf
+        if self._steps:
+            self.next_step_at = now + CROSSFADE_INTERVAL
+
+
+def _replaced_contents(present: Selection, step: Selection) -> Selection:
+    """Return a selection with the contents that a step ends, or plays at another frequency."""
+    frequencies = {content.key: content.frequency for content in step.contents}
+    replaced = list[Content]()
+    for content in present.contents:
+        is_kept = content.key in frequencies
+        if not is_kept or frequencies[content.key] != content.frequency:
+            replaced.append(content)
+    return replace(present, contents=tuple(replaced))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ selection holds the contents of all contacts; a question asks for the contents o
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol, TypeAlias
@@ -221,6 +221,14 @@ class ContentKey(NamedTuple):
 
 
 BEING_CHOSEN = "its vibration is being chosen; wait a moment"
+
+TIME_LIMIT = 1.0
+"""Time [s] after which a choice in the thread is given up; it takes some tens of milliseconds."""
+
+GIVEN_UP = (
+    f"no answer within {TIME_LIMIT:g} s: several fingers feel nothing until it is computed; touch "
+    "with one finger, and restart the daemon if it lasts"
+)
 
 
 def own_level_db_sl(sensation: Sensation) -> float:
@@ -456,6 +464,8 @@ class Selection:
     """Contacts that must not notice the contents of others."""
     is_limited: bool = field(default=False, compare=False)
     """Whether it is confined to the limits that active pulses leave."""
+    is_given_up: bool = field(default=False, compare=False)
+    """Whether it is silence in place of a choice that took too long."""
 
     @cached_property
     def contacts(self) -> dict[ContactKey, Contact]:
@@ -521,6 +531,29 @@ class Selection:
             key: _all_amplified(levels, largest_gain) for key, levels in self.foreign_levels.items()
         }
         return replace(self, contents=tuple(contents), foreign_levels=foreign_levels)
+
+    def restricted(self, keys: Set[ContactKey]) -> "Selection":
+        """Return the selection with the contents of some fingers alone; the others are quiet."""
+        if self.target_keys <= keys:
+            return self
+        targets = list[FingerTarget]()
+        quiet = [*self.quiet]
+        for finger in self.targets:
+            if finger.contact.key in keys:
+                targets.append(finger)
+            else:
+                quiet.append(finger.contact)
+        contents = [
+            content for content in self.contents if not keys.isdisjoint(content.contact_keys)
+        ]
+        unserved = [finger for finger in self.unserved if finger.contact.key in keys]
+        return replace(
+            self,
+            targets=tuple(targets),
+            quiet=tuple(quiet),
+            contents=tuple(contents),
+            unserved=tuple(unserved),
+        )
 
     def without(self, contents: Collection[Content], reason: str) -> "Selection":
         """Return the selection without some contents, whose targets feel nothing for a reason."""
@@ -645,13 +678,14 @@ class Question:
             protected=self.protected,
         )
 
-    def unanswered(self, reason: str) -> tuple[Selection, ...]:
-        """Return silence in place of the missing selections; nothing if all fingers are served."""
+    def given_up(self) -> tuple[Selection, ...]:
+        """Return silence for all targets, whose choice took too long; nothing if fingers rest."""
         if self.is_rested:
             return ()
-        selections = [self.silent(self.lasting, reason)]
+        silence = self.silent(self.lasting, GIVEN_UP)
+        selections = [replace(silence, is_given_up=True)]
         for finger in self.short:
-            selections.append(self.silent((finger,), reason))
+            selections.append(self.silent((finger,), GIVEN_UP))
         return tuple(selections)
 
 

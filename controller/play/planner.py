@@ -191,7 +191,7 @@ class Planner:
 
     def _plan_silence(self, error: Exception, now: float) -> Plan | None:
         """Plan silence after a failure; None if the last plan is silence for the same reason."""
-        self._selector.due = math.inf
+        self._selector.wait_for_change()
         failure = Selection((), self._tracker.contacts, reason=failure_text(error))
         plan = None
         if self._last_plan is None or failure != self._last_selection:

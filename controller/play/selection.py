@@ -5,16 +5,14 @@ pulse would be over before a joint answer could help, so it is never changed. On
 a time, for the fingers as they are once the previous choice has been made.
 """
 
-import asyncio
-import logging
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
-from controller.play.chooser import Chooser, contents_of
+from controller.play.chooser import ChoiceThread, Chooser, contents_of
+from controller.play.crossfades import RESTS_AFTER, Improvement, is_due
 from controller.play.intent import (
     BEING_CHOSEN,
     FADED_AFTER,
@@ -34,38 +32,15 @@ from controller.play.intent import (
 )
 from controller.play.joint_answers import STRETCH
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import CROSSFADE, FALL_AFTER
 from controller.sources.touch import Contact, ContactKey
 from model.answer.plan import MAX_SEPARATE
 from model.drive_modes import UNRESTRICTED
 from model.table.table import LocalizationTable
-from registry.threads import DaemonThreads
-
-TIME_LIMIT = 1.0
-"""Time [s] after which a choice is given up; it takes some tens of milliseconds."""
 
 # Bending wavelengths are at least 17 cm below 500 Hz, so a fingertip that has moved by about its
 # own radius is still within the disc that the pattern was chosen for. The answer for a moving
 # finger covers this distance ahead.
 MOVE_TOLERANCE = STRETCH
-
-# s; fingers rest if no finger has come, left or moved further for this long.
-_RESTS_AFTER = 0.1
-
-CROSSFADE_INTERVAL = 0.4
-"""Time [s] between two steps on the way to a better answer, each of another finger."""
-
-MIN_INTERVAL = 1.0
-"""Time [s] from the last step on such a way to the first on the next."""
-
-GIVEN_UP = (
-    f"no answer within {TIME_LIMIT:g} s: several fingers feel nothing until it is computed; touch "
-    "with one finger, and restart the daemon if it lasts"
-)
-
-_FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; contents that a step replaces
-
-_logger = logging.getLogger(__name__)
 
 
 def _is_met_by(intended: Question, chosen: Selection) -> bool:
@@ -128,17 +103,6 @@ def _at_any_level(targets: Targets) -> set[Target]:
     }
 
 
-_Future: TypeAlias = "asyncio.Future[tuple[Selection, ...]]"
-
-
-@dataclass(frozen=True, eq=False)
-class PendingChoice:
-    """A question that the thread works on, or whose answer has not been taken yet."""
-
-    question: Question
-    future: _Future
-
-
 class _Situation(NamedTuple):
     """Everything a joint answer depends on except the positions of fingers."""
 
@@ -178,23 +142,30 @@ class Selector:
         can_crossfade: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
     ) -> None:
         self.chooser = chooser
-        self._arrived = arrived
         self._can_crossfade = can_crossfade
-        self._threads = DaemonThreads()
-        self.pending: PendingChoice | None = None
-        """The choice in the thread; there is one at a time."""
-        self._given_up: _Future | None = None  # still computed
-        self._lasting = NOTHING  # as chosen, also for fingers that have left
-        self._pulses: dict[ContactKey, Selection] = {}  # active, or not started yet
-        self._lasting_fingers: dict[ContactKey, float] = {}  # of lasting targets, down since [s]
+        self._thread = ChoiceThread(arrived)
+        self._improvement = Improvement()
+        self._lasting = NOTHING
+        """The lasting contents as chosen, also for fingers that have left."""
+        self._lasting_fingers: dict[ContactKey, float] = {}
+        """When [s] the fingers of lasting targets came down."""
+        self._limits_end_at = math.inf
+        """When [s] the pulses that limit the lasting contents have faded; infinite without any."""
+        self._pulses: dict[ContactKey, Selection] = {}
+        """The contents of pulses that are active, or have not started yet."""
         self._situation: _Situation | None = None
-        # Of the last question with lasting targets.
         self._requested_situation: _Situation | None = None
-        self._steps: Sequence[Selection] = ()  # to a better answer
-        self._led_at = -math.inf  # s; time of the last step
-        self._fading = NOTHING  # contents that the last step replaced
-        self.due = math.inf
-        """Time [s] of the next selection if no contact changes: all rest, or pulses have ended."""
+        """The situation of the last question with lasting targets."""
+
+    @property
+    def pending(self) -> Question | None:
+        """The question in the thread; None if its answer has been taken."""
+        return self._thread.pending
+
+    @property
+    def due(self) -> float:
+        """Time [s] of the next selection if no contact changes."""
+        return min(self._improvement.due, self._limits_end_at)
 
     def select(
         self,
@@ -214,6 +185,8 @@ class Selector:
         short = tuple([finger for finger in served if finger.target.is_short])
         lasting = tuple([finger for finger in served if not finger.target.is_short])
         intended = Question(tuple(contacts), lasting, short, intent.protected)
+        if self._lasting.is_given_up and not self._thread.is_given_up:
+            self._lasting = NOTHING
         self._follow_fingers(intended)
         self._follow_situation(intended, capabilities, now)
         has_arrived = self._take_arrived(intended, now)
@@ -223,8 +196,8 @@ class Selector:
             self._lasting = NOTHING
         if self.pending is None:
             self._choose_if_due(intended, former_pulses, capabilities, now, has_waited=has_arrived)
-        elif self.due <= now:
-            self.due = now + _RESTS_AFTER
+        else:
+            self._put_off(now)
         parts = [self._felt_lasting(), *self._pulses.values()]
         selection = _joined(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
         target_keys = {target.key for target in intent.targets}
@@ -234,6 +207,17 @@ class Selector:
         if pending.reason is None and not pending.contents:
             return replace(pending, reason=BEING_CHOSEN)
         return pending
+
+    def choose_again(self) -> None:
+        """Drop lasting contents and the choice under way, so that the next cycle chooses again."""
+        self._lasting = NOTHING
+        self._improvement.stop()
+        self._requested_situation = None
+
+    def wait_for_change(self) -> None:
+        """Choose nothing more until a contact or the intent changes."""
+        self._improvement.stop()
+        self._limits_end_at = math.inf
 
     def _follow_fingers(self, intended: Question) -> None:
         """Drop the lasting content of fingers that have left and come back elsewhere."""
@@ -246,12 +230,12 @@ class Selector:
             if is_new and contact.key in self._lasting.target_keys:
                 returned.add(contact.key)
         if returned and not _is_met_by(intended, self._lasting):
-            self._lasting = _restricted(self._lasting, self._lasting.target_keys - returned)
+            self._lasting = self._lasting.restricted(self._lasting.target_keys - returned)
 
     def _follow_situation(
         self, intended: Question, capabilities: PlaybackCapabilities, now: float
     ) -> None:
-        """Leave the way to a better answer if the situation has changed."""
+        """Leave the steps to a better answer if the situation has changed."""
         fingers = [(contact.key, contact.since, contact.load) for contact in intended.contacts]
         situation = _Situation(
             frozenset(fingers),
@@ -262,24 +246,30 @@ class Selector:
         )
         if situation != self._situation:
             self._situation = situation
-            self._rest_again(now)
+            self._improvement.wait_for_rest(now)
 
     def _take_arrived(self, intended: Question, now: float) -> bool:
         """Take the choice of the thread if it is done; return whether it was."""
-        choice = self.pending
-        if choice is None or not choice.future.done():
+        question = self._thread.pending
+        selections = self._thread.take()
+        if question is None or selections is None:
             return False
-        self.pending = None
-        selections = choice.future.result()
         is_outdated = self._requested_situation is None or not self._still_serves(
             selections, intended
         )
-        self._take(choice.question, selections, now, is_outdated=is_outdated)
+        self._take(question, selections, now, is_outdated=is_outdated)
         return True
+
+    def _put_off(self, now: float) -> None:
+        """Put off due choices, because the thread is busy."""
+        if is_due(self._improvement.due, now):
+            self._improvement.wait_for_rest(now)
+        if is_due(self._limits_end_at, now):
+            self._limits_end_at = now + RESTS_AFTER
 
     def _felt_lasting(self) -> Selection:
         """Return the lasting contents of the fingers that still want them."""
-        return _restricted(self._lasting, self._lasting_fingers.keys())
+        return self._lasting.restricted(self._lasting_fingers.keys())
 
     def _choose_if_due(
         self,
@@ -290,46 +280,68 @@ class Selector:
         *,
         has_waited: bool,
     ) -> None:
-        """Choose contents that are due: for new pulses, and for lasting targets.
+        """Choose contents that are due: for new pulses, for lasting targets, or better ones.
 
         former_pulses: selections of pulses until now; has_waited: whether the thread was busy. A
         pulse that has waited for the thread is chosen before lasting contents, after which it would
         be late.
         """
-        is_served = not intended.lasting or _is_met_by(intended, self._lasting)
         new_pulses = tuple(
             [finger for finger in intended.short if finger.contact.key not in self._pulses]
         )
-        is_rested = False
-        if self.due < math.inf and self.due <= now:
-            self.due = math.inf
-            if intended.lasting and self._would_gain():
-                is_served = False
-            if is_served and _may_crossfade(intended):
-                is_rested = not new_pulses and self._is_at_rest(intended, now)
-                if not is_rested:
-                    self._rest_again(now)
-        if is_rested and self._steps:
-            self._lead(now)
-        elif is_rested:
+        is_served = not self._needs_choice(intended, now)
+        if is_due(self._limits_end_at, now):
+            self._limits_end_at = math.inf
+        if is_served and is_due(self._improvement.due, now):
+            if not _may_crossfade(intended):
+                self._improvement.stop()
+            elif new_pulses or not self._are_at_rest(intended.contacts, now):
+                self._improvement.wait_for_rest(now)
+            else:
+                self._improve(intended, capabilities, now)
+        if new_pulses and (is_served or has_waited):
+            question = self._question_of_pulses(intended, new_pulses, former_pulses, now)
+            self._choose(question, capabilities, now)
+            new_pulses = ()
+        if not is_served:
+            self._improvement.wait_for_rest(now)
+            question = self._question_of_lasting(intended, former_pulses, now)
+            self._choose_lasting(replace(question, short=new_pulses), capabilities, now)
+
+    def _needs_choice(self, intended: Question, now: float) -> bool:
+        """Whether lasting targets are not served, or can gain from another choice."""
+        if not intended.lasting:
+            return False
+        if not _is_met_by(intended, self._lasting):
+            return True
+        if is_due(self._limits_end_at, now) and self._lasting.is_limited:
+            return True
+        return is_due(self._improvement.rests_at, now) and self._may_serve_more()
+
+    def _may_serve_more(self) -> bool:
+        """Whether a finger is held back, and the situation has changed since."""
+        if self._requested_situation == self._situation:
+            return False
+        return any(finger.contact.key in self._lasting_fingers for finger in self._lasting.unserved)
+
+    def _are_at_rest(self, contacts: Iterable[Contact], now: float) -> bool:
+        """Whether no contact moves at a time [s], and no pulse is active or limits contents."""
+        if self._active_pulses(now) or self._lasting.is_limited:
+            return False
+        return not any(any(contact.motion.velocity(now)) for contact in contacts)
+
+    def _improve(self, intended: Question, capabilities: PlaybackCapabilities, now: float) -> None:
+        """Take the next step to a better answer at a time [s], or look for such an answer."""
+        next_step = self._improvement.next_step
+        if next_step is None:
+            self._improvement.stop()
             question = self._question_of_lasting(intended, {}, now)
             self._choose_lasting(replace(question, is_rested=True), capabilities, now)
+        elif self._can_crossfade(next_step.contents, now):
+            self._improvement.take_step(self._lasting, now)
+            self._lasting = next_step
         else:
-            pulses_first = has_waited or is_served
-            if new_pulses and pulses_first:
-                question = self._question_of_pulses(intended, new_pulses, former_pulses, now)
-                self._choose(question, capabilities, now)
-                new_pulses = ()
-            if not is_served:
-                self._rest_again(now)
-                question = self._question_of_lasting(intended, former_pulses, now)
-                self._choose_lasting(replace(question, short=new_pulses), capabilities, now)
-
-    def _is_at_rest(self, intended: Question, now: float) -> bool:
-        """Whether no pulse is active and no contact moves at a time [s]."""
-        if self._active_pulses(now):
-            return False
-        return not any(any(contact.motion.velocity(now)) for contact in intended.contacts)
+            self._improvement.stop()
 
     def _question_of_pulses(
         self,
@@ -339,16 +351,13 @@ class Selector:
         now: float,
     ) -> Question:
         """Return the question for new pulses, while all other contents continue."""
-        fading = NOTHING
-        if now < self._led_at + _FADES_FOR:
-            fading = self._fading
         return replace(
             intended,
             lasting=(),
             short=new_pulses,
             playing=self._felt_contents(former_pulses),
             kept=(self._felt_lasting(), *self._active_pulses(now)),
-            fading=fading,
+            fading=self._improvement.fading_at(now),
         )
 
     def _question_of_lasting(
@@ -368,94 +377,6 @@ class Selector:
         selections = [self._felt_lasting(), *pulses.values()]
         return {content.key: content for content in contents_of(selections)}
 
-    def _choose_lasting(
-        self, question: Question, capabilities: PlaybackCapabilities, now: float
-    ) -> None:
-        """Choose for a question with lasting targets, and note its situation."""
-        self._requested_situation = self._situation
-        self._choose(question, capabilities, now)
-
-    def _would_gain(self) -> bool:
-        """Whether another choice may give lasting targets more than the present one.
-
-        It may if pulses have ended that limited them, or if one is held back and the situation has
-        changed.
-        """
-        if self._lasting.is_limited:
-            return True
-        if self._requested_situation == self._situation:
-            return False
-        return any(finger.contact.key in self._lasting_fingers for finger in self._lasting.unserved)
-
-    def _choose(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
-        """Choose for a question at a time [s]: immediately, or in the thread if it takes long.
-
-        A choice in the thread that hangs cannot be ended, only given up. No other choice in the
-        thread begins before it has ended; its result is dropped.
-        """
-        if not question.takes_long:
-            self._take(question, self.chooser.choose(question, capabilities), now)
-        elif self._given_up is not None:
-            self._take(question, question.unanswered(GIVEN_UP), now)
-        else:
-            loop = asyncio.get_running_loop()
-            choose = partial(self.chooser.choose, question, capabilities)
-            future = loop.run_in_executor(self._threads, choose)
-            self.pending = PendingChoice(question, future)
-            future.add_done_callback(self._note_done)
-            loop.call_later(TIME_LIMIT, self._give_up, question, future)
-
-    def _give_up(self, question: Question, future: _Future) -> None:
-        """Give up a choice that is not done: lasting contents fall silent."""
-        if future.done():
-            return
-        _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
-        self._given_up = future
-        silence: _Future = asyncio.get_running_loop().create_future()
-        silence.set_result(question.unanswered(GIVEN_UP))
-        self.pending = PendingChoice(question, silence)
-        self._arrived()
-
-    def _note_done(self, future: _Future) -> None:
-        """Note that the thread is done with a choice."""
-        if future is self._given_up:
-            self._given_up = None
-            future.exception()  # retrieved, so that asyncio does not log it
-            if self._lasting.reason == GIVEN_UP:  # so that the next cycle chooses again
-                self._lasting = NOTHING
-        self._arrived()
-
-    def choose_again(self) -> None:
-        """Drop lasting contents and the choice under way, so that the next cycle chooses again."""
-        self._lasting = NOTHING
-        self._steps = ()
-        self._requested_situation = None
-
-    def _rest_again(self, now: float) -> None:
-        """Leave the way to a better answer, if any, until all fingers have rested."""
-        self._steps = ()
-        self.due = max(now + _RESTS_AFTER, self._led_at + MIN_INTERVAL)
-
-    def _lead(self, now: float) -> None:
-        """Take the next step to a better answer at a time [s], if the amplifiers can."""
-        step, *self._steps = self._steps
-        if not self._can_crossfade(step.contents, now):
-            self._steps = ()
-            return
-        if step.contents != self._lasting.contents:
-            frequencies = {content.key: content.frequency for content in step.contents}
-            fading = list[Content]()
-            for content in self._lasting.contents:
-                is_tuned = frequencies.get(content.key) != content.frequency
-                if is_tuned or content.key not in frequencies:
-                    fading.append(content)
-            self._fading = replace(self._lasting, contents=tuple(fading))
-            self._led_at = now
-        self._lasting = step
-        self.due = math.inf
-        if self._steps:
-            self.due = now + CROSSFADE_INTERVAL
-
     def _active_pulses(self, now: float) -> tuple[Selection, ...]:
         """Return the short pulses that have not ended at a time [s]."""
         active = list[Selection]()
@@ -463,6 +384,25 @@ class Selector:
             if any(now < pulse.end for pulse in selection.pulses):
                 active.append(selection)
         return tuple(active)
+
+    def _choose_lasting(
+        self, question: Question, capabilities: PlaybackCapabilities, now: float
+    ) -> None:
+        """Choose for a question with lasting targets, and note its situation."""
+        self._requested_situation = self._situation
+        self._choose(question, capabilities, now)
+
+    def _choose(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
+        """Choose for a question at a time [s]: immediately, or in the thread if it takes long.
+
+        While the thread works on a choice that was given up, it can make no other choice.
+        """
+        if not question.takes_long:
+            self._take(question, self.chooser.choose(question, capabilities), now)
+        elif self._thread.is_given_up:
+            self._take(question, question.given_up(), now)
+        else:
+            self._thread.start(self.chooser, question, capabilities)
 
     def _still_serves(self, selections: Sequence[Selection], intended: Question) -> bool:
         """Whether a late choice of lasting contents still serves the contacts on the plate.
@@ -473,7 +413,7 @@ class Selector:
         because a finger that came has lifted.
         """
         selection = next(iter(selections), NOTHING)
-        if selection.reason == GIVEN_UP:
+        if selection.is_given_up:
             return True  # it silences
         may_improve = self._lasting.is_limited or self._requested_situation == self._situation
         if not may_improve and _is_met_by(intended, self._lasting):
@@ -497,8 +437,7 @@ class Selector:
         """Take the selections for a question at a time [s]; only pulses of an outdated choice."""
         if question.is_rested:
             if selections and self._requested_situation == self._situation:
-                self._steps = selections
-                self.due = now
+                self._improvement.start(selections, now)
             return
         for selection in selections:
             contact, target = selection.targets[0]
@@ -510,14 +449,11 @@ class Selector:
     def _take_lasting(self, question: Question, selection: Selection) -> None:
         """Take the lasting contents chosen for a question."""
         self._lasting = selection
-        if selection.reason == GIVEN_UP:
-            self.due = math.inf
+        self._limits_end_at = math.inf
         if selection.is_limited:
-            last_end = -math.inf
-            for kept in question.kept:
-                for pulse in kept.pulses:
-                    last_end = max(last_end, pulse.end)
-            self.due = last_end + FADED_AFTER
+            self._limits_end_at = _last_end(question.kept) + FADED_AFTER
+        if selection.is_limited or selection.is_given_up:
+            self._improvement.stop()
 
 
 def _targets_on_plate(contacts: Sequence[Contact], intent: HapticIntent) -> Targets:
@@ -542,6 +478,15 @@ def _still_requested(
         if selection is not None and selection.targets[0].target == target:
             requested[contact.key] = selection
     return requested
+
+
+def _last_end(selections: Iterable[Selection]) -> float:
+    """Return when [s] the last pulse of some selections ends."""
+    ends = list[float]()
+    for selection in selections:
+        for pulse in selection.pulses:
+            ends.append(pulse.end)
+    return max(ends, default=-math.inf)
 
 
 def _may_crossfade(intended: Question) -> bool:
@@ -594,25 +539,6 @@ def _joined(
         first_reason if targets else reason,
         (*unserved, *skipped),
         foreign_levels=foreign_levels,
-    )
-
-
-def _restricted(selection: Selection, keys: Set[ContactKey]) -> Selection:
-    """Return a selection with the contents of some fingers alone, by key; the others are quiet."""
-    if selection.target_keys <= keys:
-        return selection
-    targets = [finger for finger in selection.targets if finger.contact.key in keys]
-    others = [finger.contact for finger in selection.targets if finger.contact.key not in keys]
-    contents = [
-        content for content in selection.contents if not keys.isdisjoint(content.contact_keys)
-    ]
-    unserved = [finger for finger in selection.unserved if finger.contact.key in keys]
-    return replace(
-        selection,
-        targets=tuple(targets),
-        quiet=(*selection.quiet, *others),
-        contents=tuple(contents),
-        unserved=tuple(unserved),
     )
 
 

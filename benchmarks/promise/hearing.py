@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from controller.play.intent import CLICK
-from drivers.playing import Voice
+from drivers.voices import Voice
 from model.arrays import FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig

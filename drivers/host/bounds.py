@@ -47,11 +47,12 @@ from operator import add, index
 from typing import NamedTuple, TypeAlias
 
 from drivers.errors import CommandError, CommandRefused
-from drivers.playing import (
+from drivers.playing import AmplifierLayer, AmplifierTone, Playback
+from drivers.protocol.definition import QUANTITIES
+from drivers.protocol.records import Values, WireQuantity
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.voices import (
     SAME,
-    AmplifierLayer,
-    AmplifierTone,
-    Playback,
     Slope,
     Voice,
     VoiceTransition,
@@ -60,9 +61,6 @@ from drivers.playing import (
     steepest,
     voices_after,
 )
-from drivers.protocol.definition import QUANTITIES
-from drivers.protocol.records import Values, WireQuantity
-from drivers.protocol.sets import Command, Envelope, LayerSet
 from registry.limits import GuardLimits
 
 _PER_RAMP = QUANTITIES["ramp"].per_unit

@@ -2,15 +2,16 @@
 
 A set starts at some time between its commit and the reply, or slightly later. The playback places
 each commit in the middle of its interval. Every transition has a half-width of its start time and a
-radius by which its first amplitude can differ. Times [s] refer to any clock.
+radius by which its first amplitude can differ (`Tolerance`). Times [s] refer to any clock.
 """
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
-from drivers.playing import LAYERS_MAX, Playback, Voice, VoiceTransition, playback_of
+from drivers.playing import LAYERS_MAX, Playback, playback_of
 from drivers.protocol.definition import (
     HIGH_STEPS,
     MAX_AHEAD,
@@ -21,10 +22,21 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
+from drivers.voices import Voice, VoiceTransition
 
 Interval: TypeAlias = tuple[float, float]
 _PER_LEVEL = QUANTITIES["level"].per_unit
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
+
+
+class Tolerance(NamedTuple):
+    """How uncertain a transition is."""
+
+    transition: VoiceTransition
+    half: float
+    """Half-width of its start time [s]."""
+    radius: float
+    """How far its first amplitude can differ."""
 
 
 class UncertainPlayback:
@@ -38,12 +50,19 @@ class UncertainPlayback:
         self.half = [0.0] * LAYERS_MAX
         # Replaced transitions by channel, and until when [s] they can still play.
         self._ghosts: list[tuple[int, VoiceTransition, float]] = []
+        # Of transitions whose start is uncertain, by identity.
+        self._tolerances: dict[int, Tolerance] = {}
+
+    def tolerance_of(self, transition: VoiceTransition) -> Tolerance:
+        """Return the tolerance of a transition."""
+        return self._tolerances.get(id(transition)) or Tolerance(transition, 0.0, 0.0)
 
     @property
     def lag(self) -> float:
         """Largest half-width of a running transition's start time [s]."""
         voices = chain.from_iterable(self.playback.all_voices)
-        return max(*self.half, *(voice.transition.half for voice in voices), 0.0)
+        halves = [self.tolerance_of(voice.transition).half for voice in voices]
+        return max(*self.half, *halves, 0.0)
 
     def is_ambiguous(
         self, when: Interval, layers: Sequence[LayerSet] | None = None, ramp: float = 0.0
@@ -99,7 +118,7 @@ class UncertainPlayback:
 
     def _half_of(self, voice: Voice) -> float:
         """Return the half-width of the time at which a voice ends."""
-        return max(voice.transition.half, self.half[voice.layer])
+        return max(self.tolerance_of(voice.transition).half, self.half[voice.layer])
 
     def _ends_after(self, one: LayerSet) -> float:
         """Return how long a layer takes to fall silent after a set that ends it [s]."""
@@ -147,27 +166,40 @@ class UncertainPlayback:
     def unsure(self, start: float, end: float) -> set[int]:
         """Return the layers that can end or start on their own in an interval."""
         self.advance(start)
-        return self.playback.unsure(end, self.half)
+        unsure = {layer for due, layer in self.playback.dues if due - self.half[layer] <= end}
+        for voice in chain.from_iterable(self.playback.all_voices):
+            transition = voice.transition
+            is_falling = not (transition.last or voice.has_ended)
+            if is_falling and transition.end - self.tolerance_of(transition).half <= end:
+                unsure.add(voice.layer)
+        return unsure
 
     def _mark(self, before: Sequence[Sequence[Voice]], when: Interval) -> None:
-        """Set the half-width and radius of every new transition."""
+        """Note the tolerance of every new transition, and the replaced transitions."""
         half = (when[1] - when[0]) / 2
-        ghosts = [each for each in self._ghosts if each[2] > when[0]]
-        for channel, were in enumerate(before):
-            left = {(each.layer, each.frequency, each.began): each.transition for each in were}
-            known = {id(each.transition) for each in were}
+        ghosts = [ghost for ghost in self._ghosts if ghost[2] > when[0]]
+        tolerances = [self.tolerance_of(transition) for _, transition, _ in ghosts]
+        for channel, former_voices in enumerate(before):
+            former_transitions = [voice.transition for voice in former_voices]
+            former_ids = {id(transition) for transition in former_transitions}
+            replaced = dict(zip(map(_key_of, former_voices), former_transitions, strict=True))
             for voice in self.playback.all_voices[channel]:
-                way = voice.transition
-                earlier = left.pop((voice.layer, voice.frequency, voice.began), None)
-                if id(way) not in known:
-                    way.half = half
-                    way.radius = 0.0 if earlier is None else radius_of(earlier, *when)
-            for way in left.values():
-                is_cut = way.last or way.end > (when[0] + when[1]) / 2
-                until = when[1] if is_cut else way.end + way.half
+                transition = voice.transition
+                former = replaced.pop(_key_of(voice), None)
+                if id(transition) in former_ids:
+                    tolerances.append(self.tolerance_of(transition))
+                else:
+                    radius = 0.0 if former is None else self.radius_of(former, *when)
+                    tolerances.append(Tolerance(transition, half, radius))
+            for transition in replaced.values():
+                tolerance = self.tolerance_of(transition)
+                is_cut = transition.last or transition.end > (when[0] + when[1]) / 2
+                until = when[1] if is_cut else transition.end + tolerance.half
                 if until > when[0]:
-                    ghosts.append((channel, way, until))
+                    ghosts.append((channel, transition, until))
+                    tolerances.append(tolerance)
         self._ghosts = ghosts
+        self._tolerances = {id(tolerance.transition): tolerance for tolerance in tolerances}
 
     def bounds(self, channel: int, start: float, end: float, *, is_exact: bool = False) -> Interval:
         """Return the lowest and the highest level of a channel during an interval.
@@ -185,34 +217,43 @@ class UncertainPlayback:
         groups: dict[float, list[VoiceTransition]] = {}
         for voice in self.playback.all_voices[channel]:
             if voice.layer in unsure and not voice.has_ended:
-                extra += voice.peak(began) + voice.transition.radius
+                extra += voice.peak(began) + self.tolerance_of(voice.transition).radius
                 continue
             groups.setdefault(voice.frequency, []).append(voice.transition)
         for ways in groups.values():
             amplitudes = [_reached(way, (start + end) / 2) for way in ways]
-            radius = sum(radius_of(way, start, end) for way in ways)
+            radius = sum(self.radius_of(way, start, end) for way in ways)
             level, added = abs(sum(amplitudes)), sum(map(abs, amplitudes))
             lowest += max(level - radius, 0.0)
             highest += (level if is_exact else added) + radius
         for at, way, until in self._ghosts:
             if at == channel and until > start:
-                extra += abs(_reached(way, start - way.half)) + way.radius
+                tolerance = self.tolerance_of(way)
+                extra += abs(_reached(way, start - tolerance.half)) + tolerance.radius
         return max(lowest - extra, 0.0), highest + extra
 
+    def radius_of(self, transition: VoiceTransition, start: float, end: float) -> float:
+        """Return how far an amplitude can differ from that in the middle of an interval.
 
-def radius_of(way: VoiceTransition, start: float, end: float) -> float:
-    """Return how far an amplitude can differ from that in the middle of an interval.
+        Its transition has begun by then.
+        """
+        tolerance = self.tolerance_of(transition)
+        center = _reached(transition, (start + end) / 2)
+        since = max(start - tolerance.half, transition.start)
+        until = max(end + tolerance.half, transition.start)
+        distances = [abs(point - center) for point in transition.points(since, until)]
+        if not tolerance.radius:
+            return max(distances)
+        # The effect of the first amplitude decays along its transition.
+        decay = replace(
+            transition, first=tolerance.radius, last=0, knots=(0j,) * len(transition.knots)
+        )
+        return max(distances) + abs(decay.at(since))
 
-    Its transition has begun by then.
-    """
-    center = _reached(way, (start + end) / 2)
-    since, until = max(start - way.half, way.start), max(end + way.half, way.start)
-    reach = max(abs(each - center) for each in way.points(since, until))
-    if not way.radius:
-        return reach
-    # The effect of the first amplitude decays along its transition.
-    left = VoiceTransition(way.start, way.step, way.radius, 0, way.end, (0j,) * len(way.knots))
-    return reach + abs(left.at(since))
+
+def _key_of(voice: Voice) -> tuple[int, float, float]:
+    """Return values that a voice keeps while its transitions change."""
+    return voice.layer, voice.frequency, voice.began
 
 
 def _reached(way: VoiceTransition, time: float) -> complex:

@@ -18,9 +18,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.playing import Voice
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
 from drivers.protocol.records import Refusal, Values
+from drivers.voices import Voice
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import make_terminal

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from drivers.playing import Playback, Voice, playback_of
+from drivers.playing import Playback, playback_of
 from drivers.protocol.definition import (
     AHEAD_MAX,
     FAULTS,
@@ -35,6 +35,7 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last, token_after
+from drivers.voices import Voice
 from sim.amplifier.amplifier_clock import AmplifierClock
 from sim.amplifier.readings import (
     LIMITED,

@@ -15,8 +15,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from drivers.playing import Voice
 from drivers.protocol.records import Values
+from drivers.voices import Voice
 from model.arrays import Point
 from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from drivers.playing import Voice
+from drivers.voices import Voice
 from model.answer.answer import Layer
 from model.transients.base_motion import BaseEnvelope, Motion, Term, along_lines, raised_cosine
 from model.vibration import Excitation, Tone

@@ -29,10 +29,11 @@ import serial
 
 from drivers import ports
 from drivers.errors import LinkError, LinkTimeout
-from drivers.playing import Playback, Voice, along
+from drivers.playing import Playback
 from drivers.ports import Port, SerialPort, open_connection
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.urls import Endpoint
+from drivers.voices import Voice, along
 from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
 from kit.clock import in_virtual_time
 from kit.courses import Taken, courses, follow

@@ -14,7 +14,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from drivers.playing import AmplifierTone, Voice, VoiceTransition
+from drivers.playing import AmplifierTone
+from drivers.voices import Voice, VoiceTransition
 from kit.direct_plate import direct_acceleration
 from kit.plates import apart, lock_in
 from model.arrays import FloatArray

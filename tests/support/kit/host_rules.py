@@ -38,7 +38,7 @@ from typing import Any, Literal, TypeAlias, get_args
 from controller.operation.plate_controller import Controller
 from drivers.host.line import Line
 from drivers.opening import Lines
-from drivers.playing import Playback, Voice
+from drivers.playing import Playback
 from drivers.protocol.definition import ENABLED, LATCHED, MESSAGES, QUANTITIES, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import (
@@ -49,6 +49,7 @@ from drivers.protocol.sets import (
     is_vibrating,
     unpack_layers,
 )
+from drivers.voices import Voice
 from drivers.wires.wire import (
     Arrival,
     BrokenReply,

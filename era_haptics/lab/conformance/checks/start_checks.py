@@ -3,7 +3,6 @@
 import asyncio
 from functools import partial
 
-from drivers.playing import VoiceTransition
 from drivers.protocol.definition import (
     CLOCK_UNKNOWN,
     COMMAND,
@@ -16,6 +15,7 @@ from drivers.protocol.definition import (
     ahead,
 )
 from drivers.protocol.sets import LayerSet
+from drivers.voices import VoiceTransition
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import RequestOutcome
 from era_haptics.lab.conformance.outcomes import expect_within

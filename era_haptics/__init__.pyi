@@ -35,7 +35,7 @@ from model.answer.answer import Answer as Answer
 from model.answer.answer import Layer as Layer
 from model.answer.answer import Sensation as Sensation
 from model.answer.answer_report import Measures as Measures
-from model.answer.stimulus import Course as Course
+from model.answer.envelope import Course as Course
 from model.answer.stimulus import Finger as Finger
 from model.answer.stimulus import Stimulus as Stimulus
 from model.config.document import ConfigError as ConfigError

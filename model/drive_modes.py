@@ -486,7 +486,7 @@ def _scores(forms: Forms, powers: Float32Array, one: IntArray, other: IntArray) 
     at, deviation = sums[:t], np.sqrt(np.maximum(sums[t : 2 * t] - sums[:t], 0))
     reaches = np.sqrt(at) - np.float32(forms.level_margin) * deviation >= forms.wanted
     ratio = at.min(axis=0) / np.maximum(sums[2 * t :].max(axis=0), _LEAST_POWER)
-    return np.asarray(np.where(reaches.all(axis=0), ratio, 0))
+    return np.where(reaches.all(axis=0), ratio, 0)
 
 
 def max_sensation_switched(forms: Forms) -> float:
@@ -505,7 +505,7 @@ def highest_levels(fields: Complex64Array) -> Float32Array:
 
 def power_forms(fields: Complex64Array) -> Float32Array:
     """Return real parts of the forms (c, f, eras, eras) of squared fields (c, f, eras)."""
-    return np.asarray((fields.conj()[..., None] * fields[..., None, :]).real)
+    return (fields.conj()[..., None] * fields[..., None, :]).real
 
 
 def _with_silence(powers: Float32Array) -> Float32Array:
@@ -523,7 +523,7 @@ def _sums_of_pairs(powers: Float32Array) -> Float32Array:
     sums = alone[:, one, :, None] + alone[:, other, None]
     same = np.arange(powers.shape[1])
     sums[:, :, same, same] += 2 * powers[:, :, one, other].swapaxes(1, 2)
-    return np.asarray(sums)
+    return sums
 
 
 def _drive(tones: list[list[int]], eras: int) -> WeightedTones:

@@ -56,7 +56,7 @@ class Element:
 
     def shape(self, xi: FloatArray) -> FloatArray:
         """Lagrange polynomials of a side at xi (n,) in -1..1: (n, order + 1), rows sum to 1."""
-        return np.asarray(np.vander(xi, self.order + 1, increasing=True) @ self._coefficients())
+        return np.vander(xi, self.order + 1, increasing=True) @ self._coefficients()
 
     def integrals(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Integrals over -1..1 of N_i N_j, N_i' N_j and N_i' N_j', exact, (n, n) each.
@@ -74,7 +74,7 @@ class Element:
 
     def _coefficients(self) -> FloatArray:
         """Monomial coefficients of the Lagrange polynomials, a column for each node of a side."""
-        return np.asarray(np.linalg.inv(np.vander(self.side, increasing=True)))
+        return np.linalg.inv(np.vander(self.side, increasing=True))
 
 
 class ElementRow:
@@ -101,7 +101,7 @@ class ElementRow:
     def numbers(self, cells: IntArray) -> IntArray:
         """Numbers of the nodes of elements (c,), (c, order + 1)."""
         order = self._element.order
-        return np.asarray(order * cells[:, None] + np.arange(order + 1))
+        return order * cells[:, None] + np.arange(order + 1)
 
     def at(self, places: FloatArray) -> tuple[IntArray, FloatArray]:
         """Numbers of nodes, and their functions, at places (p,) [m], (p, order + 1) each."""

@@ -249,7 +249,7 @@ def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
     """
     check_has_threshold(frequency, threshold)
     known, acceleration = _tabulated(threshold)
-    return np.asarray(np.exp(np.interp(np.log(frequency), np.log(known), np.log(acceleration))))
+    return np.exp(np.interp(np.log(frequency), np.log(known), np.log(acceleration)))
 
 
 def sensitivities(
@@ -285,7 +285,7 @@ def scale_in_words(threshold: str) -> str:
 def decibels(ratio: FloatArray | float) -> FloatArray:
     """Return 20 log10 of amplitude ratios, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):
-        return np.asarray(20 * np.log10(ratio))
+        return 20 * np.log10(ratio)
 
 
 NEAR_RADIUS = 0.05

@@ -14,9 +14,10 @@ import numpy as np
 
 from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
 from model.answer.answer import Answer
+from model.answer.envelope import DriveEnvelope
 from model.answer.plan import query
 from model.answer.ringing import RingingUnderFingers
-from model.answer.stimulus import DriveEnvelope, Placement
+from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig

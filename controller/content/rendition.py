@@ -13,7 +13,8 @@ import numpy as np
 
 from controller.content.pattern import MAX_HZ, MIN_HZ, Pattern, Transient, curve_at, hertz_of
 from controller.play.intent import Band
-from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION, Course
+from model.answer.envelope import Course
+from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION
 from model.arrays import FloatArray, best_of
 from model.finger import decibels
 from model.quantities import percent

@@ -10,7 +10,8 @@ from pydantic import Strict, model_validator
 
 from controller.play.intent import Band, Pulse, Target
 from controller.sources.touch import Contact, ContactKey
-from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION, Course
+from model.answer.envelope import Course
+from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION
 from model.arrays import FloatArray
 from model.config.fields import Quantity, RegionShape, Section
 from model.config.units import FREQUENCY, LEVEL

@@ -33,8 +33,8 @@ from controller.play.joint_answers import (
     selection_of,
 )
 from controller.play.shared_capabilities import PlaybackCapabilities
+from model.answer.adjustments import scaled
 from model.answer.answer import APART_HZ, Answer
-from model.answer.answer_levels import scaled
 from model.arrays import NEARLY
 from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable

@@ -16,7 +16,8 @@ import numpy as np
 
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import HELD_BACK, MIXED, OWN, SHARED, Layer, Sensation, verdict_of
-from model.answer.stimulus import SHAPED_FROM, Course, Finger, Placement
+from model.answer.envelope import SHAPED_FROM, Course
+from model.answer.stimulus import Finger, Placement
 from model.arrays import FloatArray, best_of
 from model.finger import STRONG_DB_SL, detection_threshold, fingertips_on
 from model.structure.attachments import with_patches

@@ -48,9 +48,10 @@ from model.answer.answer import (
     Layer,
     Sensation,
 )
+from model.answer.envelope import ONSET_RAMP
 from model.answer.plan import answer
 from model.answer.promise import with_tones
-from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, ONSET_RAMP, Finger, Placement, Stimulus
+from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Placement, Stimulus
 from model.arrays import Complex64Array, FloatArray, Point
 from model.finger import FINGERTIP_RADIUS
 from model.structure.attachments import MIN_LOAD

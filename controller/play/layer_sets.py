@@ -31,7 +31,7 @@ from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import QUANTITIES
 from model.answer import answer
 from model.answer.answer_report import Timing
-from model.answer.stimulus import FADE_RAMP
+from model.answer.envelope import FADE_RAMP
 from model.rig.rig import Rig
 from model.transients.base_motion import BaseEnvelope, Envelopes
 

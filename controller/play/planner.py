@@ -29,8 +29,9 @@ from drivers.host.joint_sets import PlayedSet
 from drivers.protocol.definition import HEARTBEAT
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
+from model.answer.envelope import FADE_RAMP
 from model.answer.plan import prepare_answers, query
-from model.answer.stimulus import FADE_RAMP, MIN_LEVEL_DB_SL, Placement
+from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text

@@ -24,8 +24,7 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from model import vibration as physics
-from model.answer import stimulus
-from model.answer.stimulus import Course
+from model.answer.envelope import COURSE_KNOT_STEP, Course
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.transients.base_motion import BaseEnvelope, Envelopes
@@ -74,7 +73,7 @@ def piece_of(
     count = 1
     if knots:
         joins = is_first and since > 0
-        shortest_step = _JOINING_STEP if joins else stimulus.COURSE_KNOT_STEP
+        shortest_step = _JOINING_STEP if joins else COURSE_KNOT_STEP
         length = _FIRST_PIECE if is_first else _NEXT_PIECE
         max_count = min(knots + 1, round(length / shortest_step))
         step = max(shortest_step, _SHORTEST_PIECE / max_count)

@@ -16,8 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from era_haptics.lab.checks.layout_check import loaded_plate
+from model.answer.envelope import ONSET_RAMP
 from model.answer.plan import query
-from model.answer.stimulus import ONSET_RAMP, Placement
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray
 from model.figures import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, save_figure
 from model.finger import contrast_db, fingertip_points, fingertip_weights

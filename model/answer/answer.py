@@ -1,44 +1,22 @@
 """Answer of a query: layers to play, and the resulting sensation at each finger.
 
-`Contents` is a query: K contents, each meant for its own fingers and kept from all others. Content
-j alone is a query with its fingers as targets and all others quiet, so K contents are K searches
-over one loaded plate; weights shared between contents gain 0.3 dB at most. Contents have different
-frequencies, so their powers add. From a few candidates for each content, the combination is chosen
-that has the best contrast at the worst finger on drawn plates. Promises are computed on other
-draws, the same for all tones. The contrast at finger k is
-
-    C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k,
-
-and at a quiet finger the ratio of the weakest content to all contents together. A single content
-uses the tone with the highest contrast at its level. Since contents differ in frequency, a contrast
-depends on the thresholds: the lowest over the table's threshold sets counts, in the choice and in
-the promise. The weights of a content do not depend on the threshold set. Its second harmonics do,
-and candidates are judged by the set with the loudest harmonics.
-
-`Tones` is the result of `model.answer.tone_search`. `Answer` combines query and tones: a `Layer`
-per content, and a `Sensation` per finger.
+`Answer` joins a question and its tones (`model.answer.question`): a `Layer` per content, and a
+`Sensation` per finger.
 """
 
-import cmath
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from model.answer.stimulus import (
-    ANY_BAND,
-    ONSET_RAMP,
-    Course,
-    Finger,
-    Placement,
-    pulse_ramp,
-    swings_of_pulse,
-)
-from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
+from model.answer.envelope import ONSET_RAMP
+from model.answer.question import Contents, Stream, Tones
+from model.answer.stimulus import ANY_BAND, Finger, Placement
+from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.files.csv_file import as_frame
 from model.finger import decibels
@@ -48,214 +26,8 @@ from model.transients.base_motion import Envelopes
 from model.transients.excursions import Swing
 from model.vibration import Excitation, Tone
 
-PROMISED_PERCENTILE = 9
-"""Percentile of the drawn plates that is promised.
-
-Corresponds to about the tenth percentile of exactly solved plates: effects beyond first order in
-parameters other than the thickness cost some tenths of a decibel.
-"""
-
-REACHED = 1 - 1e-5
-"""Fraction of a level that counts as reached."""
-
-KEPT, MISSING = 16, 4
-"""Number of frequencies searched for a single content, and how many can miss the level.
-
-The first is a multiple of the kernels' batch size. Frequencies with the highest bounds |c^H w| /
-sqrt(w^H R w) of w = R^-1 c are searched, with R the mean over the quiet fingers: a bound takes one
-system of equations, a search several.
-"""
-
-MIN_CANDIDATES, MAX_CANDIDATES = 4, 32
-"""Number of candidates for a single content, and the maximum over all bands of any content.
-
-This many according to the mean over fingertips, and as many according to their points.
-"""
-
-MAX_COMBINATIONS, PRUNING_STEP = 200, 4
-"""Combinations of candidates kept for the next content, and the step of draws in between.
-
-Fewer are kept for more than four contents, so that time grows with the square of their number.
-"""
-
 APART_HZ = 30.0
 """Minimum distance between the frequencies of two contents [Hz]; closer ones feel like beating."""
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Content for some fingers."""
-
-    targets: tuple[int, ...]
-    """Its fingers, by index."""
-    level_db_sl: float
-    bands: tuple[tuple[int, int], ...]
-    """First row of the table's frequencies and one past the last, for each allowed band.
-
-    There is one band unless contents can swap theirs.
-    """
-    priority: int = 0
-    """Higher priorities get the stroke first."""
-    duration: float | None = None
-    """Time over which the level is felt [s], None for a continuous content."""
-    limit_db_sl: float | None = None
-    """Upper limit of a level that the other fingers set, None for a fixed level."""
-    course: Course | None = None
-    """Envelope over the duration, whose maximum has the level."""
-
-
-@dataclass(frozen=True, eq=False)
-class Contents:
-    """Query of K contents for k fingers on a plate."""
-
-    places: tuple[Point, ...]
-    """Positions of all fingers [m], then of the additional patches of hands."""
-    loads: tuple[float, ...]
-    """Load of each finger relative to the rig's fingertip, empty for 1 each."""
-    streams: tuple[Stream, ...]
-    """The contents."""
-    quiet: tuple[int, ...]
-    """Indices of fingers that should feel nothing; others without a content are unprotected."""
-    apart_hz: float = 0.0
-    """Minimum distance between the contents' frequencies [Hz], if their bands allow it."""
-    background: Complex64Array | None = None
-    """Form of the rest of the plate at all of the table's frequencies; None if there are other
-    fingers."""
-    drive_mode: str = UNRESTRICTED
-    """Drive mode; all except UNRESTRICTED play a single content."""
-    is_shaped: bool = False
-    """Whether onsets are shaped, which leaves no ringing."""
-    least_ramp: float = 0.0
-    """Minimum ramp of short contents [s], whose ramp is otherwise a quarter of their duration."""
-    avoided: tuple[int, ...] = ()
-    """Rows of the table's frequencies that no content can use."""
-
-    @property
-    def is_ranked(self) -> bool:
-        """Whether only KEPT frequencies are searched first: for a single content of a single
-        finger."""
-        first = self.streams[0]
-        return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
-
-    @property
-    def candidates(self) -> int:
-        """Number of candidates per content and band, by means and by points."""
-        count, bands = len(self.streams), len(self.streams[0].bands)
-        return max(1, min(MIN_CANDIDATES + count // 2, MAX_CANDIDATES // bands))
-
-    @property
-    def combinations(self) -> int:
-        """Number of combinations of candidates that are kept."""
-        return min(MAX_COMBINATIONS, 4 * MAX_COMBINATIONS // len(self.streams))
-
-    @property
-    def rows(self) -> IntArray:
-        """Rows of the table's frequencies that contents can use, ascending, (f,)."""
-        bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
-        return np.setdiff1d(np.concatenate(bands), self.avoided)
-
-    def others(self, number: int) -> list[int]:
-        """Return the fingers from which the content with a given number is kept."""
-        every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
-        return sorted(every - {*self.streams[number].targets})
-
-    def of_first(self, count: int) -> Self:
-        """Return only the contents of the first `count` fingers."""
-        return replace(
-            self,
-            places=self.places[:count],
-            loads=self.loads[:count],
-            streams=tuple(
-                replace(each, targets=tuple(one for one in each.targets if one < count))
-                for each in self.streams
-            ),
-            quiet=tuple(each for each in self.quiet if each < count),
-        )
-
-    @property
-    def levels(self) -> Float32Array:
-        """Amplitude of each content relative to the threshold, (K,)."""
-        levels = [10 ** (stream.level_db_sl / 20) for stream in self.streams]
-        return np.array(levels, dtype=np.float32)
-
-
-_ROUNDING = 1e-6  # of single precision
-
-
-@dataclass(frozen=True, eq=False)
-class Tones:
-    """m tones of K contents, one or more each, and the resulting sensation of k fingers.
-
-    For s sets of thresholds, the rig's own first.
-    """
-
-    rows: list[int]
-    """Row (m,) of each tone's frequency in the table."""
-    weights: Sequence[Sequence[complex]]
-    """Weights of the ERAs (m, n), up to full stroke."""
-    gains: list[float]
-    """Gain (m,) of each tone for its level, within the stroke."""
-    owners: Sequence[int]
-    """Content (m,) of each tone."""
-    contrast_db: Sequence[Sequence[float]]
-    """Contrast (k, 3): nominal, median of the drawn plates, and promised.
-
-    The lowest over the threshold sets; NaN without other contents or fingers.
-    """
-    level_db_sl: Sequence[Sequence[float]]
-    """Level (k, 2) of a finger's own content relative to the rig's own threshold set: nominal and
-    promised."""
-    foreign_db_sl: Sequence[Sequence[float]]
-    """Upper bound of the level (k, s) of other contents on 90 % of plates, by each threshold set.
-
-    NaN at fingers that neither feel a content nor are quiet.
-    """
-    worst_db: float
-    """Promised contrast of the worst finger, NaN for a single finger."""
-    stroke_factor: float
-    """Smallest factor on the gains to fit the stroke, 1 for none."""
-    is_apart: bool
-    """Whether the frequencies keep the minimum distance."""
-
-    def excitations(
-        self,
-        content: int,
-        eras: Sequence[Source],
-        frequencies: FloatArray,
-        highest_drives: FloatArray,
-    ) -> list[Excitation]:
-        """Return the excitations of a content, one per tone, the carrier first.
-
-        frequencies (f,) [Hz] and highest_drives (f, eras) are the table's. The strongest ERA, or
-        the first ERA nearly as strong, has phase zero.
-        """
-        found = list[Excitation]()
-        every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
-        for row, values, gain, owner in every:
-            if owner != content:
-                continue
-            frequency, tones = float(frequencies[row]), dict[str, Tone]()
-            # Python's own numbers: one by one, numpy's are ten times slower.
-            enough = (1 - NEARLY) * max(map(abs, values))
-            (strongest, *_) = [value for value in values if abs(value) >= enough]
-            factor = strongest.conjugate() / abs(strongest)
-            for era, highest, value in zip(eras, highest_drives[row].tolist(), values, strict=True):
-                if value != 0:
-                    w = value * factor
-                    if w.real > 0 and abs(w.imag) < _ROUNDING * w.real:
-                        w = w.real
-                    amplitude = gain * min(abs(w), 1.0) * highest
-                    tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
-            found.append(tones)
-        return found
-
-    @classmethod
-    def none(cls, fingers: int, sets: int) -> "Tones":
-        """Return no tones, for `fingers` fingers and `sets` threshold sets."""
-        contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
-        heard = [(-math.inf,) * sets] * fingers
-        return cls([], [], [], [], contrast, level, heard, math.nan, 1.0, is_apart=True)
-
 
 MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
 """Promised contrast [dB] above which a vibration is served, and above which it is a finger's
@@ -268,6 +40,7 @@ SAME_LEVEL = 0.1
 """Difference [dB] below which two levels count as equal."""
 
 _SHORT_OF = 0.05  # dB below the wanted level that counts as reached
+_NO_POWER = 1e-60  # keeps the level of a plate at rest finite
 
 OWN, MIXED, SHARED, HELD_BACK, QUIET = "own", "mixed", "shared", "held back", "quiet"
 
@@ -374,34 +147,41 @@ class Layer:
     @property
     def drives(self) -> list[tuple[Excitation, tuple[Swing, ...]]]:
         """The excitation and its side bands, each with its envelopes."""
-        return [(each, self.swings) for each in self.excitations]
+        return [(excitation, self.swings) for excitation in self.excitations]
 
     @property
     def voices(self) -> tuple["Layer", ...]:
         """The layer without side bands, and a layer per side band, with the same ramp."""
         carrier = replace(self, side_bands=())
-        beside = replace(carrier, onset=None, ending=None, contrast_to_plate_db=None)
-        return carrier, *[replace(beside, excitation=each) for each in self.side_bands]
+        plain = replace(carrier, onset=None, ending=None, contrast_to_plate_db=None)
+        side_layers = [replace(plain, excitation=side_band) for side_band in self.side_bands]
+        return (carrier, *side_layers)
 
     def scaled(self, gain_db: float) -> "Layer":
         """Return the layer with a gain [dB] on excitations and envelopes; contrasts do not
         change."""
         factor = 10 ** (gain_db / 20)
-        louder = [
-            {n: replace(tone, amplitude=tone.amplitude * factor) for n, tone in each.items()}
-            for each in self.excitations
-        ]
-        onset, ending = [
-            each and {name: one.scaled(factor) for name, one in each.items()}
-            for each in (self.onset, self.ending)
-        ]
+        side_bands = [_scaled_excitation(side_band, factor) for side_band in self.side_bands]
         return replace(
             self,
-            excitation=louder[0],
-            side_bands=tuple(louder[1:]),
-            onset=onset,
-            ending=ending,
+            excitation=_scaled_excitation(self.excitation, factor),
+            side_bands=tuple(side_bands),
+            onset=_scaled_envelopes(self.onset, factor),
+            ending=_scaled_envelopes(self.ending, factor),
         )
+
+
+def _scaled_excitation(excitation: Excitation, factor: float) -> Excitation:
+    tones: dict[str, Tone] = {}
+    for name, tone in excitation.items():
+        tones[name] = replace(tone, amplitude=tone.amplitude * factor)
+    return tones
+
+
+def _scaled_envelopes(envelopes: Envelopes | None, factor: float) -> Envelopes | None:
+    if envelopes is None:
+        return None
+    return {name: envelope.scaled(factor) for name, envelope in envelopes.items()}
 
 
 @dataclass(frozen=True)
@@ -421,14 +201,17 @@ class Limits:
 
     def factor_within(self, layers: Sequence[Layer], table: LocalizationTable) -> float:
         """Return the factor (at most 1) that brings a table's layers within all limits."""
-        drives = [each for layer in layers for each in layer.drives]
-        share, power = table.excursion_of(drives) / self.excursion, 0.0
-        strokes = table.full_levels
-        highest = self.amplitudes or strokes
-        for name, amplitude in amplitudes_of([each for each, _ in drives]).items():
-            share = max(share, amplitude / highest[name])
-            power += (amplitude / strokes[name]) ** 2
-        return 1.0 / max(1.0, share, math.sqrt(power / self.power))
+        drives: list[tuple[Excitation, tuple[Swing, ...]]] = []
+        for layer in layers:
+            drives += layer.drives
+        full_levels = table.full_levels
+        highest = self.amplitudes or full_levels
+        largest_share = table.excursion_of(drives) / self.excursion
+        power = 0.0
+        for name, amplitude in amplitudes_of([excitation for excitation, _ in drives]).items():
+            largest_share = max(largest_share, amplitude / highest[name])
+            power += (amplitude / full_levels[name]) ** 2
+        return 1.0 / max(1.0, largest_share, math.sqrt(power / self.power))
 
 
 NO_LIMITS = Limits()
@@ -469,18 +252,18 @@ class Answer:
         """Sensation of each finger, in the order of `asked`."""
         sensations: dict[int, Sensation] = {}
         for number, stream in enumerate(self.contents.streams):
-            for finger in stream.targets:
-                sensations[finger] = self._sensation_of_content(number, finger)
-        for finger, contrast, is_disturbing in self.held:
-            sensations[finger] = replace(
-                self._sensation_of_others(finger, HELD_BACK),
+            for target in stream.targets:
+                sensations[target] = self._sensation_of_content(number, target)
+        for held_back, contrast, is_disturbing in self.held:
+            sensations[held_back] = replace(
+                self._sensation_of_others(held_back, HELD_BACK),
                 promised_contrast_db=contrast,
                 is_disturbing=is_disturbing,
             )
-        for number, finger_asked in enumerate(self.asked):
-            if finger_asked.stimulus is None:
-                sensations[number] = self._sensation_beside(number, QUIET)
-        return tuple([sensations[number] for number in range(len(self.asked))])
+        for index, finger in enumerate(self.asked):
+            if finger.stimulus is None:
+                sensations[index] = self._sensation_without_content(index, QUIET)
+        return tuple([sensations[index] for index in range(len(self.asked))])
 
     def _sensation_of_content(self, number: int, finger: int) -> Sensation:
         """Return the sensation of a finger that feels a content, both by number."""
@@ -488,7 +271,7 @@ class Answer:
         pauses = self.pauses(number)
         level, promised_level = self.levels_db_sl(number, finger)
         verdict = SHARED
-        sensation = self._sensation_beside(finger, verdict)
+        sensation = self._sensation_without_content(finger, verdict)
         if finger == stream.targets[0]:
             verdict = verdict_of(
                 sensation.promised_contrast_db, sensation.foreign_level_db_sl, pauses=pauses
@@ -503,9 +286,9 @@ class Answer:
             pauses=pauses,
         )
 
-    def _sensation_beside(self, finger: int, verdict: str) -> Sensation:
+    def _sensation_without_content(self, finger: int, verdict: str) -> Sensation:
         """Return a finger's contrasts and the level of others there, without its own content."""
-        contrast, median, promised = map(_known, self.tones.contrast_db[finger])
+        contrast, median, promised = map(_none_for_nan, self.tones.contrast_db[finger])
         return replace(
             self._sensation_of_others(finger, verdict),
             contrast_db=contrast,
@@ -517,53 +300,48 @@ class Answer:
         """Return the levels of other vibrations at a finger, without any contrast."""
         levels_by_set = tuple(self.tones.foreign_db_sl[finger])
         if math.isnan(levels_by_set[0]):
-            return Sensation(self.asked[finger], verdict)
+            levels_by_set = ()
         return Sensation(self.asked[finger], verdict, foreign_levels_db_sl=levels_by_set)
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
         """Layers to play, one per vibration."""
-        layers, least = [], self.contents.least_ramp
-        for number, stream in enumerate(self.contents.streams):
-            excitation, *sides = self.tones.excitations(
-                number, self.eras, self.frequencies, self.highest_drives
-            )
-            if self.contents.drive_mode != UNRESTRICTED:  # all tones form one excitation
-                every = (excitation, *sides)
-                excitation = {name: tone for each in every for name, tone in each.items()}
-                sides = []
-            is_plain = not self.contents.is_shaped and stream.course is None
-            duration = stream.duration if is_plain else None
-            ramp = ONSET_RAMP if duration is None else max(pulse_ramp(duration), least)
-            swings: tuple[Swing, ...] = ()
-            if stream.course is not None:
-                swings = stream.course.swings
-            elif duration is not None:
-                swings = swings_of_pulse(duration, ramp)
-            onset, ending = self.envelopes[number] if self.envelopes else (None, None)
-            layers.append(
-                Layer(
-                    excitation,
-                    stream.targets,
-                    tuple(sides),
-                    ramp,
-                    onset,
-                    ending,
-                    self.contents.drive_mode,
-                    None if self.contents.background is None else self._contrast_to_plate_db,
-                    swings,
-                )
-            )
-        return tuple(layers)
+        streams = self.contents.streams
+        return tuple([self._layer(number, stream) for number, stream in enumerate(streams)])
+
+    def _layer(self, number: int, stream: Stream) -> Layer:
+        """Return the layer that plays the content with a given number."""
+        contents = self.contents
+        excitation, *side_bands = self.tones.excitations(
+            number, self.eras, self.frequencies, self.highest_drives
+        )
+        if contents.drive_mode != UNRESTRICTED:  # all tones form one excitation
+            tones = dict(excitation)
+            for other_tones in side_bands:
+                tones.update(other_tones)
+            excitation = tones
+            side_bands = []
+        onset, ending = self.envelopes[number] if self.envelopes else (None, None)
+        return Layer(
+            excitation=excitation,
+            fingers=stream.targets,
+            side_bands=tuple(side_bands),
+            ramp=contents.ramp(stream),
+            onset=onset,
+            ending=ending,
+            drive_mode=contents.drive_mode,
+            contrast_to_plate_db=self._contrast_to_plate_db,
+            swings=contents.swings(stream),
+        )
 
     def placement(self, layer: Layer) -> Placement:
         """Return the positions of the fingers of a layer, and of all others."""
-        own = [self.asked[number] for number in layer.fingers]
-        others = [each for n, each in enumerate(self.asked) if n not in layer.fingers]
+        targets = [self.asked[number] for number in layer.fingers]
+        others = [finger for number, finger in enumerate(self.asked) if number not in layer.fingers]
         return Placement(
-            tuple([each.at for each in own]),
-            tuple([each.at for each in others]),
-            tuple([each.load for each in (*own, *others)]),
+            targets=tuple([finger.at for finger in targets]),
+            quiet=tuple([finger.at for finger in others]),
+            loads=tuple([finger.load for finger in (*targets, *others)]),
         )
 
     def levels_db_sl(self, number: int, finger: int) -> tuple[float, float]:
@@ -577,39 +355,44 @@ class Answer:
         return level - strongest_db, promised - strongest_db
 
     def lowered_db(self, number: int) -> float:
-        """Return how far the layer with a given number is below its strongest stimulus [dB]."""
+        """Return how far the layer with a given number is below its strongest stimulus [dB].
+
+        The promised level of a continuous layer counts, and the nominal level of any other.
+        """
         stream = self.contents.streams[number]
-        lasts, short = stream.duration is None, -math.inf
+        level, promised_level = self.levels_db_sl(number, stream.targets[0])
+        reached = promised_level if stream.duration is None else level
+        reduction = -math.inf
         for finger in stream.targets:
             stimulus = self.asked[finger].stimulus
             if stimulus is not None:
-                given = self.levels_db_sl(number, stream.targets[0])[lasts]
-                short = max(short, stimulus.level_db_sl - given)
-        return short if short > SAME_LEVEL else 0.0
+                reduction = max(reduction, stimulus.level_db_sl - reached)
+        return reduction if reduction > SAME_LEVEL else 0.0
 
     def pauses(self, number: int) -> bool:
         """Return whether the layer with a given number ends or is modulated, so that it masks
         nothing meanwhile."""
         stream = self.contents.streams[number]
+        if stream.duration is not None:
+            return True
         stimulus = self.asked[stream.targets[0]].stimulus
-        is_modulated = stimulus is not None and stimulus.modulation_hz is not None
-        return stream.duration is not None or (
-            is_modulated and list(self.tones.owners).count(number) > 1
-        )
+        if stimulus is None or stimulus.modulation_hz is None:
+            return False
+        return list(self.tones.owners).count(number) > 1
 
     @property
     def is_reached(self) -> bool:
         """Whether all vibrations have their nominal levels."""
-        return all(
-            self.tones.level_db_sl[finger][0] >= stream.level_db_sl - _SHORT_OF
-            for stream in self.contents.streams
-            for finger in stream.targets
-        )
+        for stream in self.contents.streams:
+            for finger in stream.targets:
+                if self.tones.level_db_sl[finger][0] < stream.level_db_sl - _SHORT_OF:
+                    return False
+        return True
 
     @property
     def excitations(self) -> list[Excitation]:
         """All excitations that play together."""
-        return [each for layer in self.layers for each in layer.excitations]
+        return [excitation for layer in self.layers for excitation in layer.excitations]
 
     @property
     def amplitudes(self) -> dict[str, float]:
@@ -619,21 +402,27 @@ class Answer:
     @property
     def promised_worst_db(self) -> float | None:
         """Promised contrast [dB] of the worst finger, None for a single finger."""
-        worst = self.tones.worst_db
-        return None if math.isnan(worst) else worst
+        return _none_for_nan(self.tones.worst_db)
 
     @property
     def lacks_contrast(self) -> bool:
         """Whether a finger has less contrast to others' vibrations than it requires."""
-        targets = [finger for stream in self.contents.streams for finger in stream.targets]
-        found, asked = self.tones.contrast_db, self.asked
-        return any(found[each][2] < asked[each].min_contrast_db for each in targets)
+        for stream in self.contents.streams:
+            for finger in stream.targets:
+                promised = self.tones.contrast_db[finger][2]
+                if promised < self.asked[finger].min_contrast_db:
+                    return True
+        return False
 
     @property
     def disturbed(self) -> list[int]:
         """Fingers, by number, with stronger vibrations of others than they allow."""
-        levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=False))
-        return [finger for finger, (by, each) in levels if by[0] > each.max_foreign_db_sl]
+        disturbed = []
+        levels_and_fingers = zip(self.tones.foreign_db_sl, self.asked, strict=False)
+        for number, (levels_by_set, finger) in enumerate(levels_and_fingers):
+            if levels_by_set[0] > finger.max_foreign_db_sl:
+                disturbed.append(number)
+        return disturbed
 
     @property
     def stroke_factor(self) -> float:
@@ -646,15 +435,15 @@ class Answer:
 
         None if there are other fingers.
         """
-        background, tones = self.contents.background, self.tones
+        background = self.contents.background
         if background is None:
             return None
-        power = 1e-60
-        every = zip(tones.rows, tones.weights, tones.gains, strict=True)
-        for row, weights, gain in every:
-            w = np.multiply(gain, weights)
-            around = max(float(np.vdot(w, background[row] @ w).real), 0.0)
-            power += around / float(self.thresholds[row]) ** 2
+        tones = self.tones
+        power = _NO_POWER
+        for row, weights, gain in zip(tones.rows, tones.weights, tones.gains, strict=True):
+            drive = np.multiply(gain, weights)
+            squared_acceleration = float(np.vdot(drive, background[row] @ drive).real)
+            power += max(squared_acceleration, 0.0) / float(self.thresholds[row]) ** 2
         (stream,) = self.contents.streams
         level = min([tones.level_db_sl[finger][0] for finger in stream.targets])
         return level - float(decibels(math.sqrt(power)))
@@ -667,27 +456,28 @@ class Answer:
         thresholds known (`Sensation.foreign_level_db_sl`), up to 30 dB higher; do not compare it
         with the others.
         """
-        at, found = np.array([each.at for each in self.asked]), self.fingers
-        frequencies = [layer.frequency or math.nan for layer in self.layers]
-        none = math.nan
-        return as_frame(
-            {
-                "x_m": at[:, 0],
-                "y_m": at[:, 1],
-                "verdict": [each.verdict for each in found],
-                "frequency_hz": [
-                    none if each.layer is None else frequencies[each.layer] for each in found
-                ],
-                "promised_level_db_sl": [each.promised_level_db_sl for each in found],
-                "promised_contrast_db": [each.promised_contrast_db for each in found],
-                "rig_foreign_level_db_sl": [each.rig_foreign_level_db_sl for each in found],
-                "worst_foreign_level_db_sl": [each.foreign_level_db_sl for each in found],
+        columns = defaultdict[str, list[Any]](list)
+        for sensation in self.fingers:
+            frequency = None
+            if sensation.layer is not None:
+                frequency = self.layers[sensation.layer].frequency
+            x, y = sensation.finger.at
+            row = {
+                "x_m": x,
+                "y_m": y,
+                "verdict": sensation.verdict,
+                "frequency_hz": frequency or math.nan,
+                "promised_level_db_sl": sensation.promised_level_db_sl,
+                "promised_contrast_db": sensation.promised_contrast_db,
+                "rig_foreign_level_db_sl": sensation.rig_foreign_level_db_sl,
+                "worst_foreign_level_db_sl": sensation.foreign_level_db_sl,
             }
-        )
+            for name, value in row.items():
+                columns[name].append(value)
+        return as_frame(columns)
 
 
-def _known(value: float) -> float | None:
-    """Return a number, None for NaN."""
+def _none_for_nan(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 

@@ -25,16 +25,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from model.answer.answer import (
     APART_HZ,
     IMPERCEPTIBLE_DB_SL,
-    PROMISED_PERCENTILE,
     QUIET,
     Answer,
     Layer,
+    Sensation,
 )
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer, prepare_answers
 from model.answer.promise import loudest_power, promise
-from model.answer.stimulus import BY_NAME, MUST, Finger, Placement, Stimulus
-from model.arrays import FloatArray, Point, lattice, nullable
+from model.answer.question import PROMISED_PERCENTILE
+from model.answer.stimulus import ANY_BAND, BY_NAME, MUST, Finger, Placement, Stimulus
+from model.arrays import Float32Array, FloatArray, Point, lattice, nullable
 from model.ensemble.draws import PROMISED_DRAWS
 from model.errors import InputError
 from model.finger import (
@@ -90,11 +91,13 @@ class Timing:
             layer = replace(layer, ending=envelopes)
         return layer
 
-    def shaped(self, found: Answer) -> Answer:
+    def shaped(self, result: Answer) -> Answer:
         """Add onsets and endings to all layers of an answer computed for shaped ones."""
-        layers = [self.with_envelopes(each, found.placement(each)) for each in found.layers]
-        both = [(each.onset, each.ending) for each in layers]
-        return replace(found, envelopes=tuple(both))
+        envelopes: list[tuple[Envelopes | None, Envelopes | None]] = []
+        for layer in result.layers:
+            shaped_layer = self.with_envelopes(layer, result.placement(layer))
+            envelopes.append((shaped_layer.onset, shaped_layer.ending))
+        return replace(result, envelopes=tuple(envelopes))
 
     def transient_contrast_db(self, layer: Layer, placement: Placement) -> float | None:
         """Contrast over the first 100 ms [dB] along the onset or the ramp, with fingers on the
@@ -162,38 +165,50 @@ class Measures:
 
 def measures(table: LocalizationTable, answer: Answer, *, timing: Timing | None = None) -> Measures:
     """Compute the measures of the first layer of an answer, in time and over the whole plate."""
-    layer, timing = answer.layers[0], timing or Timing(table)
+    timing = timing or Timing(table)
+    layer = answer.layers[0]
     placement = answer.placement(layer)
-    quiet = [each.foreign_level_db_sl for each in answer.fingers if each.verdict == QUIET]
-    loudest = max([each for each in quiet if each is not None], default=None)
+    levels_db_sl = []
+    for sensation in answer.fingers:
+        level_db_sl = sensation.foreign_level_db_sl
+        if sensation.verdict == QUIET and level_db_sl is not None:
+            levels_db_sl.append(level_db_sl)
     return Measures(
-        timing.transient_contrast_db(layer, placement),
-        timing.residual_db(layer, placement),
-        None if placement.quiet else concentration(table, layer, placement),
-        None if loudest is None else loudest <= IMPERCEPTIBLE_DB_SL,
+        transient_contrast_db=timing.transient_contrast_db(layer, placement),
+        residual_db=timing.residual_db(layer, placement),
+        concentration=None if placement.quiet else concentration(table, layer, placement),
+        is_imperceptible_to_quiet=(
+            max(levels_db_sl) <= IMPERCEPTIBLE_DB_SL if levels_db_sl else None
+        ),
     )
 
 
 def concentration(table: LocalizationTable, layer: Layer, placement: Placement) -> Concentration:
     """Compute the concentration of a layer without quiet fingers; takes some milliseconds."""
-    contacts, loads, tones = placement.targets, placement.loads, layer.excitation
+    plate = table.plate
+    contacts = placement.targets
+    amplitudes_at = partial(
+        table.amplitudes, layer.excitation, contacts=contacts, loads=placement.loads
+    )
     felt = []
     for target in contacts:
-        disc = fingertip_points(*target, table.plate)
-        _, found = table.amplitudes(tones, disc, contacts=contacts, loads=loads)
-        felt.append(found.sum(axis=0) @ fingertip_weights(*target, table.plate))
-    points = cell_centres(table.plate)
-    frequencies, amplitudes = table.amplitudes(tones, points, contacts=contacts, loads=loads)
+        _, disc_amplitudes = amplitudes_at(fingertip_points(*target, plate))
+        felt.append(disc_amplitudes.sum(axis=0) @ fingertip_weights(*target, plate))
+    points = cell_centres(plate)
+    frequencies, amplitudes = amplitudes_at(points)
     near = ~is_beyond(points, contacts)
-    return concentration_of(frequencies, amplitudes, near, felt=min(felt), plate=table.plate)
+    return concentration_of(frequencies, amplitudes, near, felt=min(felt), plate=plate)
 
 
 def cell_centres(plate: Plate) -> FloatArray:
     """Return the centers (p, 2) [m] of small equal cells that tile the plate."""
-    count_x, count_y = (max(1, round(side / _SPACING)) for side in (plate.length, plate.width))
-    x = np.linspace(0, plate.length, 2 * count_x + 1)[1::2]
-    y = np.linspace(0, plate.width, 2 * count_y + 1)[1::2]
-    return lattice(x, y)
+    return lattice(_cell_middles(plate.length), _cell_middles(plate.width))
+
+
+def _cell_middles(side: float) -> FloatArray:
+    """Return the middles (n,) [m] of equal cells along a side [m]."""
+    count = max(1, round(side / _SPACING))
+    return np.linspace(0, side, 2 * count + 1)[1::2]
 
 
 def concentration_of(
@@ -233,44 +248,60 @@ def hand_weighting(frequencies: FloatArray) -> FloatArray:
     acceleration to velocity at 15.9 Hz (ISO 5349-1:2001, annex A; ISO 8041).
     """
     s = 1j * np.asarray(frequencies)
-    band = s**2 / (s**2 + _LOW / _BAND_Q * s + _LOW**2)
-    band = band * _HIGH**2 / (s**2 + _HIGH / _BAND_Q * s + _HIGH**2)
+    high_pass = s**2 / (s**2 + _LOW / _BAND_Q * s + _LOW**2)
+    band = high_pass * _HIGH**2 / (s**2 + _HIGH / _BAND_Q * s + _HIGH**2)
     fall = (s + _FALL) * _FALL / (s**2 + _FALL / _FALL_Q * s + _FALL**2)
     return np.asarray(np.abs(band * fall))
 
 
-def exposures(table: LocalizationTable, found: Answer) -> list[float]:
+def exposures(table: LocalizationTable, result: Answer) -> list[float]:
     """Return the weighted RMS acceleration at each finger of an answer [m/s²].
 
     Normal to the plate, for all vibrations together at full strength, at the loudest point of the
     fingertip; 90 % of plates do not exceed it. Harmonics above 1 kHz, where thresholds end, are
     ignored.
     """
-    tones, contents = found.tones, found.contents
+    tones = result.tones
+    contents = result.contents
     if not tones.rows:
-        return [0.0] * len(found.asked)
-    rows, gains = np.array(tones.rows), np.array(tones.gains)
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
-    drawn = PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64)
-    frequencies, at_harmonics = table.frequencies[rows], table.compared_harmonic_thresholds[rows]
-    factors, of_harmonics = (
-        (gains * np.where(np.isfinite(each), each, 0.0) * hand_weighting(at)) ** 2 / 2
-        for each, at in ((table.thresholds[rows], frequencies), (at_harmonics, 2 * frequencies))
+        return [0.0] * len(result.asked)
+    rows = np.array(tones.rows)
+    gains = np.array(tones.gains)
+    weights = np.array(tones.weights, dtype=np.complex64)
+    frequencies = table.frequencies[rows]
+    factors = _mean_squares(gains, table.thresholds[rows], frequencies)
+    harmonic_factors = _mean_squares(
+        gains, table.compared_harmonic_thresholds[rows], 2 * frequencies
     )
-    power = fingers.powers(*drawn) * factors.astype(np.float32)[:, None, None, None]
-    harmonics = fingers.harmonics(*drawn) * of_harmonics.astype(np.float32)[:, None, None]
-    return [
-        promise(np.sqrt(loudest_power(power, harmonics, rows, finger)), 100 - PROMISED_PERCENTILE)
-        for finger in range(len(found.asked))
-    ]
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
+    power = fingers.powers(PROMISED_DRAWS, rows, weights) * factors[:, None, None, None]
+    harmonics = fingers.harmonics(PROMISED_DRAWS, rows, weights) * harmonic_factors[:, None, None]
+    weighted = []
+    for finger in range(len(result.asked)):
+        mean_square = loudest_power(power, harmonics, rows, finger)
+        weighted.append(promise(np.sqrt(mean_square), 100 - PROMISED_PERCENTILE))
+    return weighted
+
+
+def _mean_squares(
+    gains: FloatArray, thresholds: Float32Array, frequencies: FloatArray
+) -> Float32Array:
+    """Return the weighted mean square (m,) of tones with gains, relative to the threshold.
+
+    0 beyond the thresholds, which are infinite there.
+    """
+    known = np.where(np.isfinite(thresholds), thresholds, 0.0)
+    mean_squares = (gains * known * hand_weighting(frequencies)) ** 2 / 2
+    return mean_squares.astype(np.float32)
 
 
 def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
     """Answer a query with the keys of a batch line. Raises InputError."""
-    asked, timing = _parsed(values, {}), Timing(table)
-    prepare_answers(table, asked.mode)
+    line = _parsed(values, {})
+    timing = Timing(table)
+    prepare_answers(table, line.mode)
     timing.prepare(table.frequencies.tolist())
-    return answer_as_json(table, asked, timing)
+    return answer_as_json(table, line, timing)
 
 
 def query_batch(
@@ -315,13 +346,24 @@ class _Own(BaseModel):
 
     def finger(self, level_db_sl: float) -> Finger:
         """Build the finger; level_db_sl: the line's level, for a finger without a level."""
-        given = self.model_dump(exclude_none=True)
-        at = _point(given.pop("at"))
-        if self.band_hz is not None:
-            given["band_hz"] = _point(self.band_hz)
-        keys = [key for key in Stimulus.__dataclass_fields__ if key in given]
-        stimulus = {"level_db_sl": level_db_sl} | {key: given.pop(key) for key in keys}
-        return Finger(at, Stimulus(**stimulus), **given)
+        if self.level_db_sl is not None:
+            level_db_sl = self.level_db_sl
+        stimulus = Stimulus(
+            level_db_sl,
+            ANY_BAND if self.band_hz is None else _point(self.band_hz),
+            duration=self.duration,
+            modulation_hz=self.modulation_hz,
+            is_limit=self.is_limit,
+            name=self.name,
+        )
+        return Finger(
+            _point(self.at),
+            stimulus,
+            load=self.load,
+            priority=self.priority,
+            sharing=self.sharing,
+            is_protected=self.is_protected,
+        )
 
 
 class _Line(BaseModel):
@@ -352,55 +394,61 @@ def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line
     """Validate a query given as JSON or as keys and values; raises InputError."""
     try:
         if isinstance(line, str):
-            asked = _Line.model_validate_json(line)
+            parsed = _Line.model_validate_json(line)
         else:
-            asked = _Line.model_validate(line)
+            parsed = _Line.model_validate(line)
     except ValidationError as error:
         key, rule = first_problem(error)
-        raise InputError(
-            f"{key}: {rule}"
-            if key
-            else 'line must be a JSON object such as {"target": [0.08, 0.06], "quiet": '
-            f"[[0.22, 0.16]]}}; {rule}"
-        ) from None
-    given = asked.model_fields_set
-    if others := given & (_OF_TARGETS if asked.own else _OF_OWN):
-        without = "without" if asked.own else "with"
-        raise InputError(f"{', '.join(sorted(others))} must be given {without} own")
-    if {"target", "targets"} <= given:
+        if key:
+            raise InputError(f"{key}: {rule}") from None
+        example = '{"target": [0.08, 0.06], "quiet": [[0.22, 0.16]]}'
+        raise InputError(f"line must be a JSON object such as {example}; {rule}") from None
+    keys = parsed.model_fields_set
+    misplaced = keys & (_OF_TARGETS if parsed.own else _OF_OWN)
+    if misplaced:
+        without = "without" if parsed.own else "with"
+        raise InputError(f"{', '.join(sorted(misplaced))} must be given {without} own")
+    if {"target", "targets"} <= keys:
         raise InputError("target must be given without targets; list all fingers in targets")
-    return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
+    missing = {key: value for key, value in defaults.items() if key not in keys}
+    return parsed.model_copy(update=missing)
 
 
-def answer_as_json(table: LocalizationTable, asked: _Line, timing: Timing) -> dict[str, Any]:
+def answer_as_json(table: LocalizationTable, line: _Line, timing: Timing) -> dict[str, Any]:
     """Answer a line; its loads belong to the quiet fingers if others have their own vibrations."""
-    if asked.own:
-        fingers = [each.finger(asked.level_db_sl) for each in asked.own]
-        loads = _loads(asked, len(asked.quiet), what="quiet finger")
+    if line.own:
+        fingers = [finger.finger(line.level_db_sl) for finger in line.own]
+        quiet_loads = _loads(line, len(line.quiet), what="quiet finger")
     else:
-        targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
-        stimulus = Stimulus(asked.level_db_sl, duration=asked.duration, name="target")
-        loads = _loads(asked, len(targets) + len(asked.quiet), what="finger")
-        fingers = [Finger(_point(at), stimulus, loads.pop(0), sharing=MUST) for at in targets]
+        targets = [*line.targets] if line.target is None else [line.target, *line.targets]
+        stimulus = Stimulus(line.level_db_sl, duration=line.duration, name="target")
+        loads = _loads(line, len(targets) + len(line.quiet), what="finger")
+        fingers = []
+        for at, load in zip(targets, loads, strict=False):
+            fingers.append(Finger(_point(at), stimulus, load, sharing=MUST))
+        quiet_loads = loads[len(targets) :]
+    quiet = []
+    for at, load in zip(line.quiet, quiet_loads, strict=True):
+        quiet.append(Finger(_point(at), load=load))
     started = time.perf_counter()
-    found = answer(
+    result = answer(
         table,
         fingers,
-        quiet=[Finger(_point(at), load=load) for at, load in zip(asked.quiet, loads, strict=True)],
-        drive_mode=asked.mode,
-        shaped=asked.envelopes,
-        apart_hz=asked.apart_hz,
-        bands_may_swap=asked.bands_may_swap,
+        quiet=quiet,
+        drive_mode=line.mode,
+        shaped=line.envelopes,
+        apart_hz=line.apart_hz,
+        bands_may_swap=line.bands_may_swap,
     )
-    if asked.envelopes:
-        found = timing.shaped(found)
+    if line.envelopes:
+        result = timing.shaped(result)
     elapsed = time.perf_counter() - started
-    more = None if asked.own else measures(table, found, timing=timing)
-    return _shown(table, found, more) | {"solve_time_s": elapsed}
+    result_measures = None if line.own else measures(table, result, timing=timing)
+    return _as_json(table, result, result_measures) | {"solve_time_s": elapsed}
 
 
-def _loads(asked: _Line, count: int, *, what: str) -> list[float]:
-    loads = asked.loads or [1.0] * count
+def _loads(line: _Line, count: int, *, what: str) -> list[float]:
+    loads = line.loads or [1.0] * count
     if len(loads) != count:
         raise InputError(f"loads must have one value per {what} ({count}), got {len(loads)}")
     return [*loads]
@@ -410,43 +458,52 @@ def _point(pair: list[float]) -> Point:
     return pair[0], pair[1]
 
 
-def _shown(table: LocalizationTable, found: Answer, more: Measures | None) -> dict[str, Any]:
-    """Return the JSON object of an answer; more: its measures, if all targets share a vibration."""
-    shown: dict[str, Any] = {
-        "fingers": [
-            {
-                "at_m": list(each.finger.at),
-                "verdict": each.verdict,
-                "is_foreign_felt": each.is_foreign_felt,
-                "layer": each.layer,
-                "level_db_sl": nullable(each.level_db_sl),
-                "promised_level_db_sl": nullable(each.promised_level_db_sl),
-                "contrast_db": nullable(each.contrast_db),
-                "median_contrast_db": nullable(each.median_contrast_db),
-                "promised_contrast_db": nullable(each.promised_contrast_db),
-                "foreign_level_db_sl": nullable(each.foreign_level_db_sl),
-                "rig_foreign_level_db_sl": nullable(each.rig_foreign_level_db_sl),
-                "lowered_db": each.lowered_db,
-                "exposure_m_s2": exposure,
-            }
-            for each, exposure in zip(found.fingers, exposures(table, found), strict=True)
-        ],
-        "layers": [_layer_as_json(each, table) for each in found.layers],
-        "promised_worst_db": nullable(found.promised_worst_db),
-        "stroke_factor": found.stroke_factor,
-        "applied": list(found.applied),
+def _as_json(
+    table: LocalizationTable, result: Answer, result_measures: Measures | None
+) -> dict[str, Any]:
+    """Return the JSON object of an answer, with its measures if all targets share a vibration."""
+    fingers = []
+    for sensation, exposure in zip(result.fingers, exposures(table, result), strict=True):
+        fingers.append(_sensation_as_json(sensation) | {"exposure_m_s2": exposure})
+    document: dict[str, Any] = {
+        "fingers": fingers,
+        "layers": [_layer_as_json(layer, table) for layer in result.layers],
+        "promised_worst_db": nullable(result.promised_worst_db),
+        "stroke_factor": result.stroke_factor,
+        "applied": list(result.applied),
     }
-    if more is not None:
-        near = more.concentration
-        shown |= {
-            "transient_contrast_db": more.transient_contrast_db,
-            "residual_db": more.residual_db,
-            "surroundings_contrast_95_db": near and near.contrast_95_db,
-            "area_above_half_m2": near and near.area_above_half,
-            "energy_share_near": near and near.energy_share_near,
-            "is_imperceptible_to_quiet": more.is_imperceptible_to_quiet,
-        }
-    return shown
+    if result_measures is not None:
+        document |= _measures_as_json(result_measures)
+    return document
+
+
+def _sensation_as_json(sensation: Sensation) -> dict[str, Any]:
+    return {
+        "at_m": list(sensation.finger.at),
+        "verdict": sensation.verdict,
+        "is_foreign_felt": sensation.is_foreign_felt,
+        "layer": sensation.layer,
+        "level_db_sl": nullable(sensation.level_db_sl),
+        "promised_level_db_sl": nullable(sensation.promised_level_db_sl),
+        "contrast_db": nullable(sensation.contrast_db),
+        "median_contrast_db": nullable(sensation.median_contrast_db),
+        "promised_contrast_db": nullable(sensation.promised_contrast_db),
+        "foreign_level_db_sl": nullable(sensation.foreign_level_db_sl),
+        "rig_foreign_level_db_sl": nullable(sensation.rig_foreign_level_db_sl),
+        "lowered_db": sensation.lowered_db,
+    }
+
+
+def _measures_as_json(result_measures: Measures) -> dict[str, Any]:
+    near = result_measures.concentration
+    return {
+        "transient_contrast_db": result_measures.transient_contrast_db,
+        "residual_db": result_measures.residual_db,
+        "surroundings_contrast_95_db": near and near.contrast_95_db,
+        "area_above_half_m2": near and near.area_above_half,
+        "energy_share_near": near and near.energy_share_near,
+        "is_imperceptible_to_quiet": result_measures.is_imperceptible_to_quiet,
+    }
 
 
 def _layer_as_json(layer: Layer, table: LocalizationTable) -> dict[str, Any]:
@@ -454,7 +511,7 @@ def _layer_as_json(layer: Layer, table: LocalizationTable) -> dict[str, Any]:
     return {
         "frequency_hz": layer.frequency,
         "drive": table.drive_of(layer.excitation),
-        "side_bands": [table.drive_of(each) for each in layer.side_bands],
+        "side_bands": [table.drive_of(side_band) for side_band in layer.side_bands],
         "fingers": list(layer.fingers),
         "mode": layer.drive_mode,
         "ramp_s": layer.ramp,
@@ -472,7 +529,7 @@ def _envelopes_as_json(
     if envelopes is None:
         return None
 
-    def shown(name: str, amplitude: complex) -> dict[str, float]:
+    def level_and_phase(name: str, amplitude: complex) -> dict[str, float]:
         level = abs(amplitude) / table.full_levels[name]
         return {"level": level, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
@@ -480,8 +537,8 @@ def _envelopes_as_json(
         name: {
             "frequency_hz": envelope.frequency,
             "step_s": envelope.step,
-            "start": shown(name, envelope.start),
-            "knots": [shown(name, knot) for knot in envelope.knots],
+            "start": level_and_phase(name, envelope.start),
+            "knots": [level_and_phase(name, knot) for knot in envelope.knots],
         }
         for name, envelope in envelopes.items()
     }

@@ -205,11 +205,11 @@ class FingerForms:
         # The field's variation over a target does not make its level uncertain.
         target_power = contacts.uncertain[:, targets] + outer(mean)
         forms = Forms(
-            mean.swapaxes(0, 1),
-            target_power.swapaxes(0, 1),
-            contacts.power[:, others],
-            table.thresholds.take(self.rows),
-            10 ** (level_db_sl / 20),
+            targets=mean.swapaxes(0, 1),
+            target_power=target_power.swapaxes(0, 1),
+            quiet=contacts.power[:, others],
+            threshold=table.thresholds.take(self.rows),
+            wanted=10 ** (level_db_sl / 20),
         )
         gain_variance = table.uncertainty.gain_variance
         if background is not None:

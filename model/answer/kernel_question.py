@@ -1,4 +1,7 @@
-"""Questions to the C kernel that chooses tones: what it reads, and the tones that it returns."""
+"""Pack a question for the C kernel, and read its tones.
+
+The question and the answer are those of the numpy reference (`model.answer.question`).
+"""
 
 from array import array
 from collections.abc import Iterable
@@ -10,7 +13,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from model import drive_modes
-from model.answer.answer import (
+from model.answer.fingers_on_plate import (
+    CENTRE_AND_RIM,
+    MAX_FINGERS_BY_POINT,
+    MAX_VARIANCE_FINE,
+)
+from model.answer.question import (
     KEPT,
     MISSING,
     PROMISED_PERCENTILE,
@@ -18,11 +26,6 @@ from model.answer.answer import (
     REACHED,
     Contents,
     Tones,
-)
-from model.answer.fingers_on_plate import (
-    CENTRE_AND_RIM,
-    MAX_FINGERS_BY_POINT,
-    MAX_VARIANCE_FINE,
 )
 from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import (
@@ -160,16 +163,24 @@ def ask_kernel(library: Kernels, table: LocalizationTable, contents: Contents) -
         judging=addressof(fingers.judging),
         promise=addressof(fingers.promise),
     )
-    layout = _FigureLayout(era_count, len(streams), finger_count, packed.rules.sets)
+    set_count = packed.rules.sets
+    figure_count = (2 * era_count + 1) * len(streams) + (3 + 2 + set_count) * finger_count + 2
     rows = array("i", bytes(_SIZE * len(streams)))
-    figures = array("f", bytes(_SIZE * layout.size))
+    figures = array("f", bytes(_SIZE * figure_count))
     result = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
     status = run_kernel(
         library.library.answer, result, packed.plates, packed.raster, packed.rules, question
     )
     if status != FOUND:
         raise AssertionError("contents must have tones")
-    return layout.tones(rows.tolist(), figures.tolist(), is_apart=bool(result.is_apart))
+    return _read_tones(
+        rows.tolist(),
+        figures.tolist(),
+        era_count=era_count,
+        finger_count=finger_count,
+        set_count=set_count,
+        is_apart=bool(result.is_apart),
+    )
 
 
 def _packed_numbers(contents: Contents) -> "array[int]":
@@ -187,42 +198,35 @@ def _packed_numbers(contents: Contents) -> "array[int]":
     return array("i", [*starts, *targets, *contents.quiet, *priorities, *bands])
 
 
-@dataclass(frozen=True)
-class _FigureLayout:
-    """Where the kernel writes which figures: `found` in C."""
-
-    era_count: int
-    content_count: int
-    finger_count: int
-    set_count: int
-
-    @property
-    def size(self) -> int:
-        """Number of all figures."""
-        of_contents = (2 * self.era_count + 1) * self.content_count
-        of_fingers = (3 + 2 + self.set_count) * self.finger_count
-        return of_contents + of_fingers + 2
-
-    def tones(self, rows: list[int], figures: list[float], *, is_apart: bool) -> Tones:
-        """Return the tones of rows and figures."""
-        gains_start = 2 * self.era_count * self.content_count
-        contrast_start = gains_start + self.content_count
-        level_start = contrast_start + 3 * self.finger_count
-        foreign_start = level_start + 2 * self.finger_count
-        worst_db, stroke_factor = figures[-2:]
-        weights = map(complex, figures[:gains_start:2], figures[1:gains_start:2])
-        return Tones(
-            rows=rows,
-            weights=_grouped(weights, self.era_count),
-            gains=figures[gains_start:contrast_start],
-            owners=range(self.content_count),
-            contrast_db=_grouped(figures[contrast_start:level_start], 3),
-            level_db_sl=_grouped(figures[level_start:foreign_start], 2),
-            foreign_db_sl=_grouped(figures[foreign_start:-2], self.set_count),
-            worst_db=worst_db,
-            stroke_factor=stroke_factor,
-            is_apart=is_apart,
-        )
+def _read_tones(
+    rows: list[int],
+    figures: list[float],
+    *,
+    era_count: int,
+    finger_count: int,
+    set_count: int,
+    is_apart: bool,
+) -> Tones:
+    """Return the tones of rows and figures, which are in the order of `found` in C."""
+    content_count = len(rows)
+    gains_start = 2 * era_count * content_count
+    contrast_start = gains_start + content_count
+    level_start = contrast_start + 3 * finger_count
+    foreign_start = level_start + 2 * finger_count
+    worst_db, stroke_factor = figures[-2:]
+    weights = map(complex, figures[:gains_start:2], figures[1:gains_start:2])
+    return Tones(
+        rows=rows,
+        weights=_grouped(weights, era_count),
+        gains=figures[gains_start:contrast_start],
+        owners=range(content_count),
+        contrast_db=_grouped(figures[contrast_start:level_start], 3),
+        level_db_sl=_grouped(figures[level_start:foreign_start], 2),
+        foreign_db_sl=_grouped(figures[foreign_start:-2], set_count),
+        worst_db=worst_db,
+        stroke_factor=stroke_factor,
+        is_apart=is_apart,
+    )
 
 
 def _grouped(values: Iterable[_T], size: int) -> list[tuple[_T, ...]]:

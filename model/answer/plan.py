@@ -8,40 +8,39 @@ each only if the previous ones leave room for it. A vibration that could not be 
 finger anyway comes last. If not even the first can be served, the best answer tried is returned,
 except that bounds set by fingers always hold, by silence if necessary.
 
-Then follow modulation (`model.answer.modulation`) and the levels: as strong as quiet fingers allow,
-and within the amplifiers' limits (`model.answer.answer_levels`).
+Modulation, the levels that quiet fingers allow and the amplifiers' limits follow
+(`model.answer.adjustments`).
 """
 
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import filterfalse
 from typing import Any
 
 import numpy as np
 
+from model.answer.adjustments import (
+    as_quiet_fingers_allow,
+    as_ramps_allow,
+    gains_within,
+    is_served,
+    scaled,
+    with_gains,
+    with_modulation,
+)
 from model.answer.answer import (
     APART_HZ,
     MIN_CONTRAST_DB,
     NO_LIMITS,
     SAME_LEVEL,
     Answer,
-    Contents,
     Limits,
-    Stream,
-    Tones,
 )
-from model.answer.answer_levels import (
-    as_quiet_fingers_allow,
-    as_ramps_allow,
-    gains_within,
-    scaled,
-    with_gains,
-)
-from model.answer.modulation import is_served, with_modulation
+from model.answer.question import Contents, Stream, Tones
 from model.answer.stimulus import (
     ANY,
     MIN_LEVEL_DB_SL,
@@ -106,11 +105,12 @@ def answer(
     """
     if not 0 <= apart_hz < math.inf:  # False for NaN
         raise InputError(f"apart_hz must be a distance of frequencies in Hz, got {apart_hz}")
-    every_finger = (*fingers, *map(_quiet_finger, quiet))
-    check_fingers(every_finger, table.plate)
+    quiet_fingers = map(_quiet_finger, quiet)
+    all_fingers = (*fingers, *quiet_fingers)
+    check_fingers(all_fingers, table.plate)
     search = _Search(
-        table,
-        every_finger,
+        table=table,
+        fingers=all_fingers,
         drive_mode=checked_mode(drive_mode or table.drive_mode),
         is_shaped=shaped,
         apart_hz=apart_hz,
@@ -119,7 +119,8 @@ def answer(
         limits=limits,
         min_contrast_db=min_contrast_db,
     )
-    result = search.within_limits(search.solve())
+    result = search.solve()
+    result = search.within_limits(result)
     notes = (*_steady_notes(result), *_level_notes(result))
     if not notes:
         return result  # a copy would lose cached results
@@ -177,12 +178,13 @@ def _level_notes(result: Answer) -> Iterator[str]:
     """Yield notes about vibrations that are weaker than requested, with the reason."""
     for stream in result.contents.streams:
         first = stream.targets[0]
-        lasts = stream.duration is None
-        level = result.tones.level_db_sl[first][lasts]
+        is_continuous = stream.duration is None
+        nominal_level, promised_level = result.tones.level_db_sl[first]
+        level = promised_level if is_continuous else nominal_level
         is_reached = level >= stream.level_db_sl - SAME_LEVEL
         if stream.limit_db_sl is not None or is_reached:
             continue
-        if result.stroke_factor < 1 - NEARLY or lasts:
+        if result.stroke_factor < 1 - NEARLY or is_continuous:
             reason = "the limit of the ERAs' stroke and the amplifiers"
         else:
             reason = "so that quiet fingers feel at most half of it"
@@ -204,8 +206,8 @@ class _Plan:
 class _Search:
     """Search for an answer; fingers are numbered in their order."""
 
-    table: LocalizationTable = field(kw_only=False)
-    fingers: tuple[Finger, ...] = field(kw_only=False)
+    table: LocalizationTable
+    fingers: tuple[Finger, ...]
     drive_mode: str
     is_shaped: bool
     apart_hz: float
@@ -327,7 +329,7 @@ class _Search:
         distances: dict[tuple[tuple[int, ...], ...], float] = {}
         for number, second in enumerate(plan.contents):
             for first in plan.contents[:number]:
-                pairs = [(self.fingers[a], self.fingers[b]) for a in second for b in first]
+                pairs = self._finger_pairs(second, first)
                 if all(a.may_feel_one_with(b, are_apart=are_apart) for a, b in pairs):
                     distances[first, second] = min(math.dist(a.at, b.at) for a, b in pairs)
         if not distances:
@@ -340,24 +342,31 @@ class _Search:
 
         Independent of their stimuli; infinite without others.
         """
-        pairs = [(self.fingers[a], self.fingers[b]) for a in own for b in others]
+        pairs = self._finger_pairs(own, others)
         if not pairs:
             return math.inf
         felt, quiet = best_by(pairs, lambda pair: -math.dist(pair[0].at, pair[1].at))
-        both = (
+        nearest_pair = (
             replace(felt, stimulus=Stimulus()),
             replace(quiet, stimulus=None, is_protected=True),
         )
-        alone = replace(self, fingers=both, avoided=frozenset())
+        alone = replace(self, fingers=nearest_pair, avoided=frozenset())
         return alone._measure(_Plan(((0,),))).tones.worst_db
 
-    def _quiet_beside(self, felt: Sequence[int]) -> list[int]:
+    def _finger_pairs(
+        self, group: Sequence[int], other_group: Sequence[int]
+    ) -> list[tuple[Finger, Finger]]:
+        """Return all pairs of a finger of one group and one of the other."""
+        fingers = self.fingers
+        return [(fingers[a], fingers[b]) for a in group for b in other_group]
+
+    def _protected_from(self, felt: Sequence[int]) -> list[int]:
         """Return the fingers that must not feel the vibration of the given fingers."""
-        return [
-            number
-            for number, finger in enumerate(self.fingers)
-            if number not in felt and finger.is_protected and not finger.is_load
-        ]
+        protected = []
+        for number, finger in enumerate(self.fingers):
+            if number not in felt and finger.is_protected and not finger.is_load:
+                protected.append(number)
+        return protected
 
     def _serve_in_turn(self, plan: _Plan, tried: Sequence[Answer]) -> Answer:
         """Serve contents one after another, each only if all earlier ones still meet their
@@ -380,7 +389,8 @@ class _Search:
                 result = attempt
                 served.append(content)
             elif content == order[0] and not _is_out_of_bounds(attempt):
-                within_bounds = [*filterfalse(_is_out_of_bounds, (*tried, attempt))]
+                attempts = (*tried, attempt)
+                within_bounds = [*filterfalse(_is_out_of_bounds, attempts)]
                 result = best_by(within_bounds, worst_of)
                 break
         return self._with_held_back(result, with_content)
@@ -393,7 +403,7 @@ class _Search:
         """
         first = self.fingers[content[0]]
         return (
-            self._contrast_alone(content, self._quiet_beside(content)) < self.min_contrast_db,
+            self._contrast_alone(content, self._protected_from(content)) < self.min_contrast_db,
             {*content}.isdisjoint(together.disturbed),
             -first.priority,
             not first.is_protected,
@@ -423,11 +433,12 @@ class _Search:
         by_priority = sorted(contents, key=lambda content: -self.fingers[content[0]].priority)
         host, guests = by_priority[0], by_priority[1:]
         joined = sum(guests, host)
-        plan_contents = [
-            joined if content == host else content
-            for content in plan.contents
-            if content not in guests
-        ]
+        plan_contents = []
+        for content in plan.contents:
+            if content == host:
+                plan_contents.append(joined)
+            elif content not in guests:
+                plan_contents.append(content)
         at = _at(self.fingers[host[0]])
         notes = [f"{_at(self.fingers[guest[0]])} shares the vibration of {at}" for guest in guests]
         return replace(plan, contents=tuple(plan_contents), applied=(*plan.applied, *notes))
@@ -469,7 +480,7 @@ class _Search:
     def _contents(self, plan: _Plan) -> Contents:
         """Return the contents of a plan for the tone search."""
         streams = tuple(self._stream(content) for content in plan.contents)
-        quiet = tuple(self._quiet_beside(sum(plan.contents, ())))
+        quiet = tuple(self._protected_from(sum(plan.contents, ())))
         background = None
         if len(streams) == 1 and not quiet:
             targets = [self.fingers[finger].at for finger in streams[0].targets]
@@ -484,11 +495,11 @@ class _Search:
             (self.table.plate.length, self.table.plate.width),
         )
         return Contents(
-            tuple(positions),
-            tuple(loads),
-            streams,
-            quiet,
-            self.apart_hz,
+            places=tuple(positions),
+            loads=tuple(loads),
+            streams=streams,
+            quiet=quiet,
+            apart_hz=self.apart_hz,
             background=background,
             drive_mode=self.drive_mode,
             is_shaped=self.is_shaped,
@@ -499,20 +510,25 @@ class _Search:
         """Return the stream of a content: its first finger's stimulus at the highest requested
         level."""
         fingers = [self.fingers[number] for number in content]
+        stimuli = [finger.stimulus for finger in fingers if finger.stimulus is not None]
+        stimulus = stimuli[0]
+        level = max([requested.level_db_sl for requested in stimuli])
+        if stimulus.course is not None:
+            level += stimulus.course.strongest_db
+        limit = None
+        if stimulus.is_limit:
+            limit = level
+            level = min(level, FELT_DB_SL)
         bands = tuple(self._bands.values()) if self.bands_may_swap else (self._bands[content[0]],)
-        levels = [finger.stimulus.level_db_sl for finger in fingers if finger.stimulus]
-        level = max(levels, default=-math.inf)
-        priority = max(finger.priority for finger in fingers)
-        duration, limit, course = None, None, None
-        stimulus = fingers[0].stimulus
-        if stimulus is not None:
-            duration, course = stimulus.duration, stimulus.course
-            if course is not None:
-                level += course.strongest_db
-            if stimulus.is_limit:
-                limit = level
-                level = min(level, FELT_DB_SL)
-        return Stream(tuple(content), float(level), bands, priority, duration, limit, course)
+        return Stream(
+            targets=tuple(content),
+            level_db_sl=float(level),
+            bands=bands,
+            priority=max([finger.priority for finger in fingers]),
+            duration=stimulus.duration,
+            limit_db_sl=limit,
+            course=stimulus.course,
+        )
 
     def _measure(self, plan: _Plan) -> Answer:
         """Choose the tones of a plan and compute the sensations of all fingers."""

@@ -11,17 +11,13 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from model.answer.answer import (
-    IMPERCEPTIBLE_DB_SL,
-    PROMISED_PERCENTILE,
-    Answer,
-    Contents,
-    Tones,
-)
+from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer
+from model.answer.envelope import shaped_gain
 from model.answer.fingers_on_plate import DriveTones, FingersOnPlate
+from model.answer.question import PROMISED_PERCENTILE, Contents, Tones
 from model.answer.ringing import RingingUnderFingers, on_drawn_plates
-from model.answer.stimulus import shaped_gain
 from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray
+from model.drive_modes import WeightedTones
 from model.ensemble.draws import PROMISED_DRAWS, percentile
 from model.finger import decibels
 from model.table.table import LocalizationTable
@@ -110,10 +106,11 @@ def promised(
         shares = shares[: len(ways)]
         powers = _along_ways(powers, contents, tones, ways)
     comparisons = list[_Comparison]()
-    tone_sensitivities = table.sensitivities[:, tones.rows]
-    harmonic_sensitivities = table.harmonic_sensitivities[:, tones.rows]
-    for by_tone, by_harmonic in zip(tone_sensitivities, harmonic_sensitivities, strict=True):
-        comparisons.append(_compared(contents, tones, powers.scaled(by_tone, by_harmonic), shares))
+    for threshold_set in range(len(table.threshold_sets)):
+        tone_sensitivities = table.sensitivities[threshold_set, tones.rows]
+        harmonic_sensitivities = table.harmonic_sensitivities[threshold_set, tones.rows]
+        powers_of_set = powers.scaled(tone_sensitivities, harmonic_sensitivities)
+        comparisons.append(_compared(contents, tones, powers_of_set, shares))
 
     contrast = np.array([comparison.contrast for comparison in comparisons])
     foreign_level = np.array([comparison.foreign_level for comparison in comparisons])
@@ -160,8 +157,13 @@ def _along_ways(
     powers: _Powers, contents: Contents, tones: DriveTones, ways: Sequence[Sequence[int]]
 ) -> _Powers:
     """Return the mean power along the path of each finger, with side bands at other fingers."""
-    power = np.stack([powers.tones[:, [*way]].mean(axis=1) for way in ways], axis=1)
-    harmonics = np.stack([powers.harmonics[:, [*way]].mean(axis=1) for way in ways], axis=1)
+    mean_powers = list[Float32Array]()
+    mean_harmonics = list[Float32Array]()
+    for way in ways:
+        mean_powers.append(powers.tones[:, [*way]].mean(axis=1))
+        mean_harmonics.append(powers.harmonics[:, [*way]].mean(axis=1))
+    power = np.stack(mean_powers, axis=1)
+    harmonics = np.stack(mean_harmonics, axis=1)
     era_count = tones.weights.shape[1]
     for tone, owner in enumerate(tones.owners.tolist()):
         targets = [*contents.streams[owner].targets]
@@ -188,22 +190,19 @@ def _compared(
             own_tones[finger] = is_own
             felt_by_finger[finger] = felt
             level[finger] = felt[0], promise(felt)
+    weakest = np.min([*felt_by_finger.values()], axis=0)
+    for finger in contents.quiet:
+        own_tones[finger] = np.zeros(len(tones.rows), dtype=bool)
+        felt_by_finger[finger] = weakest
 
-    no_tones = np.zeros(len(tones.rows), dtype=bool)
     ratios = list[Float32Array]()
-    for finger in (*felt_by_finger, *contents.quiet):
-        if finger in felt_by_finger:
-            felt = felt_by_finger[finger]
-        else:
-            felt = np.min([*felt_by_finger.values()], axis=0)
-        is_foreign = ~own_tones.get(finger, no_tones)
+    for finger, felt in felt_by_finger.items():
+        is_foreign = ~own_tones[finger]
         if not is_foreign.any():
             continue
-        foreign_power = loudest_power(
-            powers.tones[is_foreign], powers.harmonics[is_foreign], tones.rows[is_foreign], finger
-        )
+        foreign_power = _loudest_of(powers, tones, is_foreign, finger)
         foreign_amplitude = np.sqrt(np.maximum(foreign_power, _TINY))
-        ratio = np.asarray(felt / foreign_amplitude)
+        ratio = np.asarray(felt / foreign_amplitude, dtype=np.float32)
         ratios.append(ratio)
         foreign_level[finger] = promise(foreign_amplitude, 100 - PROMISED_PERCENTILE)
         contrast[finger] = figures(ratio)
@@ -212,6 +211,15 @@ def _compared(
         # The contrast of a single content is that at the loudest quiet finger.
         contrast[[*contents.streams[0].targets]] = worst
     return _Comparison(level, contrast, foreign_level, worst[2])
+
+
+def _loudest_of(
+    powers: _Powers, tones: DriveTones, is_counted: NDArray[np.bool_], finger: int
+) -> Float32Array:
+    """Return the power (d,) of some tones (m,) at the loudest point of a finger."""
+    return loudest_power(
+        powers.tones[is_counted], powers.harmonics[is_counted], tones.rows[is_counted], finger
+    )
 
 
 def _over_durations(
@@ -225,7 +233,6 @@ def _over_durations(
     spectra, on each plate."""
     power = steady.tones.copy()
     harmonics = steady.harmonics.copy()
-    shares = fingers.tips.fine_weights
     for tone, owner in enumerate(tones.owners.tolist()):
         stream = contents.streams[owner]
         if stream.duration is None:
@@ -238,18 +245,37 @@ def _over_durations(
             continue
         targets = [*stream.targets]
         drive = [(int(tones.rows[tone]), tones.weights[tone])]
-        sensation = content_ringing.over_drive(drive)
-        spectrum = DriveTones.of([content_ringing.spectrum(drive)])
-        spectrum_power = fingers.powers(PROMISED_DRAWS, spectrum.rows, spectrum.weights)
-        energy = spectrum_power.sum(axis=0)
-        steady_mean = _nominal_means(steady.tones[tone], shares, targets)
-        energy_mean = _nominal_means(energy, shares, targets)
-        target_gains = sensation.gains[targets]
-        factors = np.square(target_gains * steady_mean / np.maximum(energy_mean, _TINY))
-        power[tone] = on_drawn_plates(energy, sensation.heard, factors.min())
-        power[tone, targets] = energy[targets] * factors[:, None, None]
+        target_gains = content_ringing.over_drive(drive).gains[targets]
+        power[tone] = _power_over_envelope(
+            fingers, drive, steady.tones[tone], targets, content_ringing
+        )
         harmonics[tone] *= np.float32(target_gains.min() ** 2)
     return _Powers(power, harmonics)
+
+
+def _power_over_envelope(
+    fingers: FingersOnPlate,
+    drive: WeightedTones,
+    steady: Float32Array,
+    targets: Sequence[int],
+    ringing: RingingUnderFingers,
+) -> Float32Array:
+    """Return the power (k, p, 1 + d) of a drive over its envelope, on each plate.
+
+    steady (k, p, 1 + d): the power of the steady drive.
+    """
+    shares = fingers.tips.fine_weights
+    sensation = ringing.over_drive(drive)
+    spectrum = DriveTones.of([ringing.spectrum(drive)])
+    spectrum_power = fingers.powers(PROMISED_DRAWS, spectrum.rows, spectrum.weights)
+    energy = spectrum_power.sum(axis=0)
+    steady_mean = _nominal_means(steady, shares, targets)
+    energy_mean = _nominal_means(energy, shares, targets)
+    target_gains = sensation.gains[targets]
+    factors = np.square(target_gains * steady_mean / np.maximum(energy_mean, _TINY))
+    power = np.asarray(on_drawn_plates(energy, sensation.heard, factors.min()), dtype=np.float32)
+    power[targets] = energy[targets] * factors[:, None, None]
+    return power
 
 
 def _nominal_means(
@@ -286,12 +312,7 @@ def _gains_to_levels(
         others = contents.others(number)
         if not others:
             continue
-        foreign_powers = [
-            loudest_power(
-                powers.tones[is_own], powers.harmonics[is_own], tones.rows[is_own], finger
-            )
-            for finger in others
-        ]
+        foreign_powers = [_loudest_of(powers, tones, is_own, finger) for finger in others]
         foreign_amplitude = np.sqrt(np.maximum(np.max(foreign_powers, axis=0), _TINY))
         contrast = promise(felt / foreign_amplitude)
         half = levels[number] * 10 ** (-MIN_RAISED_CONTRAST_DB / 20)
@@ -363,8 +384,8 @@ def felt_amplitudes(
     for tone in np.flatnonzero(is_own).tolist():
         amplitude = np.sqrt(power[tone])
         is_cancelling = ~is_own & (rows == rows[tone])
-        for foreign_tone in np.flatnonzero(is_cancelling).tolist():
-            amplitude = amplitude - np.sqrt(power[foreign_tone])
+        for cancelling_tone in np.flatnonzero(is_cancelling).tolist():
+            amplitude = amplitude - np.sqrt(power[cancelling_tone])
         squares += np.maximum(amplitude, 0) ** 2
     means = [shares[target] @ np.sqrt(squares[target]) for target in targets]
     return np.asarray(np.min(means, axis=0))

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from model.answer.answer import Contents
-from model.answer.stimulus import DriveEnvelope, OverDuration, pulse_ramp
+from model.answer.envelope import DriveEnvelope, OverDuration
+from model.answer.question import Contents
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.drive_modes import Forms, WeightedTones
 from model.finger import detection_threshold
@@ -47,13 +47,19 @@ class RingingUnderFingers:
             envelope: DriveEnvelope | None = None
             if stream.course is not None:
                 envelope = DriveEnvelope.of_course(stream.course)
-            elif stream.duration is not None and not contents.is_shaped:
-                ramp = max(pulse_ramp(stream.duration), contents.least_ramp)
-                envelope = DriveEnvelope.of_pulse(stream.duration, ramp)
+            elif stream.duration is not None and contents.is_pulse(stream):
+                envelope = DriveEnvelope.of_pulse(stream.duration, contents.ramp(stream))
             if envelope is None:
                 ringing.append(None)
             else:
-                ringing.append(cls(table, contents.places, contents.loads, envelope))
+                ringing.append(
+                    cls(
+                        table=table,
+                        places=contents.places,
+                        loads=contents.loads,
+                        envelope=envelope,
+                    )
+                )
         return ringing
 
     @cached_property
@@ -174,4 +180,4 @@ def on_drawn_plates(
     the target, applied to the additional energy on other plates.
     """
     added = factor * (energies - energies[..., :1])
-    return np.asarray(np.maximum(heard[..., None] + added, 0.0))
+    return np.maximum(heard[..., None] + added, 0.0)

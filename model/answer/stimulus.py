@@ -1,31 +1,23 @@
-"""Fingers on a plate, the stimulus for each, and the envelope of its drive.
+"""Fingers on a plate with their requests, and the checks of these.
 
-A stimulus is continuous, or has a duration with a constant level or an envelope. The plate follows
-its drive late: over 40 ms, the RMS at a finger is several decibels below that of the steady
-vibration, ten decibels on a sharp resonance, and the plate rings after the end. Therefore a finger
-is assumed to feel the mean of its demodulated acceleration over the duration. Any other fingertip
-counts by its power, including ringing. With an envelope, both are evaluated over the strongest
-moments (`DriveEnvelope`).
+A stimulus is continuous, or has a duration with a constant level or an envelope
+(`model.answer.envelope`).
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
 from numbers import Real
 
 import numpy as np
-from scipy import fft
 
-from model.arrays import FloatArray, Point
+from model.answer.envelope import Course
+from model.arrays import Point
 from model.config.units import in_metres
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
 from model.structure.attachments import check_loads
 from model.structure.plate import Plate
-from model.transients.base_motion import rise
-from model.transients.excursions import CLICKS_APART, DECAYED, Swing
-from model.transients.knots import RISE
 from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD, MAX_HAND_LOAD
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
@@ -81,7 +73,7 @@ class Stimulus:
     allow."""
     name: str | None = None
     """Fingers whose stimuli have the same name can share one vibration."""
-    course: "Course | None" = field(default=None, hash=False, repr=False)
+    course: Course | None = field(default=None, hash=False, repr=False)
     """Envelope of the strength, which also sets the duration."""
 
     def __post_init__(self) -> None:
@@ -101,34 +93,48 @@ class Stimulus:
         if not isinstance(self.is_limit, bool):
             raise InputError(f"is_limit must be True or False, got {shown(self.is_limit)}")
         if self.course is not None:
-            if not isinstance(self.course, Course):
-                raise InputError(
-                    "course must be one such as era.Course((0, 0.5), (1, 0)), got "
-                    f"{shown(self.course)}"
-                )
-            if self.duration not in (None, self.course.duration):
-                raise InputError(
-                    f"duration must be left out for a stimulus with a course, got {self.duration:g}"
-                )
+            _check_course(self.course, self.duration)
             object.__setattr__(self, "duration", self.course.duration)
         if self.duration is not None:
-            expect_number(self.duration, what="duration", unit="seconds")
-            if not _MIN_DURATION <= self.duration <= _MAX_DURATION:  # False for NaN
-                raise InputError(
-                    f"duration must be from {_MIN_DURATION:g} to {_MAX_DURATION:g} s, got "
-                    f"{self.duration:g}; leave it out for a continuous stimulus"
-                )
+            _check_duration(self.duration)
         if self.modulation_hz is not None:
-            expect_number(self.modulation_hz, what="modulation_hz", unit="Hz")
-            if not MIN_MODULATION <= self.modulation_hz <= MAX_MODULATION:
-                raise InputError(
-                    f"modulation_hz must be from {MIN_MODULATION:g} to {MAX_MODULATION:g} Hz, got "
-                    f"{self.modulation_hz:g}"
-                )
+            _check_modulation(self.modulation_hz)
             if self.duration is not None and self.course is None:
                 raise InputError(
                     "modulation_hz must be left out for a stimulus with a duration but no course"
                 )
+
+
+def _check_course(course: Course, duration: float | None) -> None:
+    """Raise InputError for anything but a course, or for another duration [s] than the course's."""
+    if not isinstance(course, Course):
+        raise InputError(
+            f"course must be one such as era.Course((0, 0.5), (1, 0)), got {shown(course)}"
+        )
+    if duration not in (None, course.duration):
+        raise InputError(
+            f"duration must be left out for a stimulus with a course, got {duration:g}"
+        )
+
+
+def _check_duration(duration: float) -> None:
+    """Raise InputError for a duration [s] out of range."""
+    expect_number(duration, what="duration", unit="seconds")
+    if not _MIN_DURATION <= duration <= _MAX_DURATION:  # False for NaN
+        raise InputError(
+            f"duration must be from {_MIN_DURATION:g} to {_MAX_DURATION:g} s, got "
+            f"{duration:g}; leave it out for a continuous stimulus"
+        )
+
+
+def _check_modulation(frequency: float) -> None:
+    """Raise InputError for a frequency of modulation [Hz] out of range."""
+    expect_number(frequency, what="modulation_hz", unit="Hz")
+    if not MIN_MODULATION <= frequency <= MAX_MODULATION:
+        raise InputError(
+            f"modulation_hz must be from {MIN_MODULATION:g} to {MAX_MODULATION:g} Hz, got "
+            f"{frequency:g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -173,12 +179,12 @@ class Finger:
             _check_pair(
                 self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in meters"
             )
-        for what in ("load", "min_contrast_db", "max_foreign_db_sl"):
-            given = getattr(self, what)
-            if type(given) is not float:
-                expect_number(given, what=what, unit=_UNITS[what])
-            if math.isnan(given):
-                raise InputError(f"{what} must be a number of {_UNITS[what]}, got {given}")
+        for what, unit in _UNITS.items():
+            value = getattr(self, what)
+            if type(value) is not float:
+                expect_number(value, what=what, unit=unit)
+            if math.isnan(value):
+                raise InputError(f"{what} must be a number of {unit}, got {value}")
         if not (self.stimulus is None or isinstance(self.stimulus, Stimulus)):
             raise InputError(
                 f"stimulus must be one such as era.Stimulus(20), got {shown(self.stimulus)}"
@@ -200,8 +206,8 @@ class Finger:
     @property
     def is_load(self) -> bool:
         """Whether only its load counts: a resting hand, or a finger without any request."""
-        asks_nothing = self.stimulus is None and not self.is_protected
-        return asks_nothing or self.load > MAX_FINGER_LOAD
+        has_no_request = self.stimulus is None and not self.is_protected
+        return has_no_request or self.load > MAX_FINGER_LOAD
 
     @property
     def name(self) -> str | None:
@@ -213,10 +219,17 @@ class Finger:
 
         are_apart: whether each could have its own vibration.
         """
-        one, two = self.stimulus, other.stimulus
-        if one is None or two is None or NEVER in (self.sharing, other.sharing):
+        stimulus = self.stimulus
+        other_stimulus = other.stimulus
+        if stimulus is None or other_stimulus is None:
             return False
-        if (one.duration, one.is_limit, one.course) != (two.duration, two.is_limit, two.course):
+        if NEVER in (self.sharing, other.sharing):
+            return False
+        if (
+            stimulus.duration != other_stimulus.duration
+            or stimulus.is_limit != other_stimulus.is_limit
+            or stimulus.course != other_stimulus.course
+        ):
             return False
         if not are_apart or self.sharing == other.sharing == ANY:
             return True
@@ -245,16 +258,16 @@ class Placement:
 
 def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
     """Build the fingers of a placement: targets that must share one stimulus, and quiet ones."""
-    loads = placed.loads or (1.0,) * len(placed.contacts)
-    if len(loads) != len(placed.contacts):
-        raise InputError(
-            f"loads must have one value per finger ({len(placed.contacts)}), got {len(loads)}"
-        )
-    count = len(placed.targets)
-    return [
-        Finger(at, stimulus if n < count else None, load, sharing=MUST)
-        for n, (at, load) in enumerate(zip(placed.contacts, loads, strict=True))
-    ]
+    finger_count = len(placed.contacts)
+    loads = placed.loads or (1.0,) * finger_count
+    if len(loads) != finger_count:
+        raise InputError(f"loads must have one value per finger ({finger_count}), got {len(loads)}")
+    fingers = []
+    for number, (position, load) in enumerate(zip(placed.contacts, loads, strict=True)):
+        is_target = number < len(placed.targets)
+        finger_stimulus = stimulus if is_target else None
+        fingers.append(Finger(position, finger_stimulus, load, sharing=MUST))
+    return fingers
 
 
 def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
@@ -278,21 +291,29 @@ def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
     if loads.count(1.0) < len(loads):
-        check_loads([each.load for each in fingers if each.stimulus])
-        check_loads([each.load for each in fingers if not each.stimulus], highest=MAX_HAND_LOAD)
+        check_loads([finger.load for finger in fingers if finger.stimulus])
+        without_stimulus = [finger.load for finger in fingers if not finger.stimulus]
+        check_loads(without_stimulus, highest=MAX_HAND_LOAD)
     check_on_plate("finger", [finger.at for finger in fingers], plate)
     for number, finger in enumerate(fingers):
-        x, y = finger.at
         for other in fingers[:number]:
-            gap = math.dist(other.at, finger.at)
-            if gap >= FINGERTIP_RADIUS or finger.is_load or other.is_load:
-                continue
-            is_one = finger.stimulus == other.stimulus is None or finger.must_feel_one_with(other)
-            if not (is_one and gap > 0):
-                raise InputError(
-                    f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm "
-                    f"from the one at ({other.at[0]:g}, {other.at[1]:g}) m"
-                )
+            _check_apart(finger, other)
+
+
+def _check_apart(finger: Finger, other: Finger) -> None:
+    """Raise InputError for two fingers within a fingertip, unless they feel the same or nothing."""
+    gap = math.dist(other.at, finger.at)
+    if gap >= FINGERTIP_RADIUS or finger.is_load or other.is_load:
+        return
+    are_quiet = finger.stimulus is None and other.stimulus is None
+    if gap > 0 and (are_quiet or finger.must_feel_one_with(other)):
+        return
+    x, y = finger.at
+    other_x, other_y = other.at
+    raise InputError(
+        f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm from the one at "
+        f"({other_x:g}, {other_y:g}) m"
+    )
 
 
 def check_level(level_db_sl: float) -> None:
@@ -305,249 +326,8 @@ def check_level(level_db_sl: float) -> None:
         )
 
 
-def _check_pair(given: object, *, what: str, such_as: str) -> None:
+def _check_pair(value: object, *, what: str, such_as: str) -> None:
     """Raise InputError for anything but two numbers."""
-    pair = given if isinstance(given, Sequence | np.ndarray) else ()
+    pair = value if isinstance(value, Sequence | np.ndarray) else ()
     if len(pair) != 2 or not (isinstance(pair[0], Real) and isinstance(pair[1], Real)):
-        raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(given)}")
-
-
-_MAX_POINTS = 20_000
-"""Maximum number of times in an envelope."""
-
-COURSE_KNOT_STEP = 0.010
-"""Interval of the knots with which amplifiers play an envelope [s], if the wires are fast
-enough."""
-
-STRONGEST = 0.040
-"""Total time of the strongest moments by which an envelope is felt [s]."""
-
-_STEP, _SHORT = 0.005, 1.0  # s; sampling interval of envelopes, halved for durations up to _SHORT
-
-SILENCE = 1e-6
-"""Replaces 0, so that levels are finite."""
-
-
-@dataclass(frozen=True)
-class Course:
-    """Envelope of a stimulus: fraction of its highest amplitude over the duration."""
-
-    times: Sequence[float]
-    """Times [s], ascending from 0 to the duration."""
-    shares: Sequence[float]
-    """Fraction at each time, 0 to 1; linear in between."""
-
-    def __post_init__(self) -> None:
-        """Check times and fractions; raises InputError."""
-        if not 2 <= len(self.times) == len(self.shares) <= _MAX_POINTS:
-            raise InputError(
-                f"a course must have 2 to {_MAX_POINTS} times and as many shares, got "
-                f"{len(self.times)} and {len(self.shares)}"
-            )
-        if self.times[0] != 0 or not (np.diff(self.times) > 0).all():
-            raise InputError("times of a course must ascend from 0")
-        shares = np.array(self.shares)
-        if not ((shares >= 0) & (shares <= 1)).all():  # False for NaN
-            raise InputError(
-                f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
-                f"{max(self.shares):g}"
-            )
-
-    @property
-    def duration(self) -> float:
-        """Its last time [s]."""
-        return self.times[-1]
-
-    @property
-    def step(self) -> float:
-        """Sampling interval [s]."""
-        return _STEP if self.duration > _SHORT else _STEP / 2
-
-    @cached_property
-    def strongest_db(self) -> float:
-        """RMS of its strongest moments [dB], relative to a constant 1."""
-        times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
-        samples, count = np.maximum(self.at(times), SILENCE), round(STRONGEST / self.step)
-        return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
-
-    @cached_property
-    def swings(self) -> tuple[Swing, ...]:
-        """Possible playbacks of the envelope from knot to knot: once, then repeated.
-
-        One per knot interval: slower wires use longer intervals.
-        """
-        found = []
-        for step in (COURSE_KNOT_STEP, 2 * COURSE_KNOT_STEP, 4 * COURSE_KNOT_STEP):
-            count, rest = (math.ceil(each / step) for each in (self.duration, DECAYED))
-            times = np.asarray(step * np.arange(1, count + rest + 1), dtype=float)
-            once = np.where(times < self.duration, self.at(times), 0.0)
-            again = self.at(np.mod(times, self.duration))
-            found.append(Swing((0.0, *once.tolist(), *again.tolist()), step))
-        return tuple(found)
-
-    def at(self, times: FloatArray) -> FloatArray:
-        """Return fractions at times [s] (n,), 0 outside."""
-        return np.asarray(np.interp(times, *self._line, left=0.0, right=0.0))
-
-    @cached_property
-    def _line(self) -> tuple[FloatArray, FloatArray]:
-        """Times and fractions as arrays, cached: they are read for every piece played."""
-        return np.array(self.times), np.array(self.shares)
-
-
-ONSET_RAMP = 0.040
-"""Duration of a plain ramp [s].
-
-Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
-at 20 dB SL the target still feels it after a fifth of the ramp (docs/concepts/transients.md).
-"""
-
-FADE_RAMP = 0.020
-"""Duration of the fade under fingers that stay on the plate [s]; a shorter one feels like a tap."""
-
-_RINGING = 0.100
-"""Time after a short effect over which the ringing at other fingers counts [s].
-
-Weights suppress ringing only for this time: with 20 ms it was up to 7 dB stronger afterwards on
-four ERAs, and 18 dB on a large table.
-"""
-
-SHAPED_FROM = 0.2
-"""Shortest duration of a stimulus with a shaped onset [s], which settles in half of that."""
-
-_PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
-"""Step [s] of pulses, and maximum number of steps within the duration."""
-
-_RESOLUTION = 1.0  # Hz, minimum resolution of an envelope's spectrum
-
-
-def pulse_ramp(duration: float) -> float:
-    """Return the plain ramp [s] of a vibration: a quarter of its duration [s].
-
-    The vibration is then nearly constant: no 40 ms of a 40 ms click (ringing included) are more
-    than 0.8 dB (median) stronger than the first 40 ms. With a ramp of half the duration it is 1.5
-    dB, with the full duration 3 dB.
-    """
-    return min(ONSET_RAMP, duration / 4)
-
-
-def shaped_gain(duration: float) -> float:
-    """Return the mean amplitude over a duration [s] with a shaped onset, 1 if steady.
-
-    The target follows a raised cosine, whose square has a mean of 3/8.
-    """
-    return math.sqrt(1 - 5 / 8 * min(RISE, duration) / duration)
-
-
-@lru_cache
-def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
-    """Return the envelopes of consecutive pulses of a duration [s], with plain ramps [s].
-
-    The first ends along the pulse's ramp, the second along FADE_RAMP. A pulse longer than
-    SHAPED_FROM counts as that long: by then its onset has decayed as far as its end will.
-    """
-    length = min(duration, SHAPED_FROM)
-    count = math.ceil((length + DECAYED) / _PULSE_STEP)
-    times = np.asarray(_PULSE_STEP * np.arange(count), dtype=float)
-    again = max(duration, CLICKS_APART)
-    onset, after = rise(times, ramp), np.asarray(times - length)
-    plain, faded = (
-        Swing(tuple((onset - rise(after, end)).tolist()), _PULSE_STEP, again)
-        for end in (ramp, FADE_RAMP)
-    )
-    return plain, faded
-
-
-@dataclass(frozen=True, eq=False)
-class OverDuration:
-    """Sensation of k fingers over the duration of a drive, on the nominal plate."""
-
-    gains: FloatArray
-    """Mean amplitude (k,) relative to the steady one."""
-    heard: FloatArray
-    """Squared amplitude at each point relative to the threshold (k, p), mean over the strongest
-    time."""
-
-
-@dataclass(frozen=True, eq=False)
-class DriveEnvelope:
-    """Envelope of a drive, up to _RINGING after its end or until it is steady."""
-
-    values: FloatArray
-    """Envelope (n,) at even steps."""
-    step: float
-    """Time [s] between values."""
-    within: int
-    """Number of steps over which it is felt: the strongest ones of an envelope, else the first."""
-    share: float = 1.0
-    """Fraction of the duration covered by these steps; the rest is steady."""
-    is_course: bool = False
-
-    @classmethod
-    def of_pulse(cls, duration: float, ramp: float) -> "DriveEnvelope":
-        """Build the envelope of a pulse of a duration [s] with plain ramps [s].
-
-        It includes the ringing after the end, where a quiet finger can feel most.
-        """
-        length = min(duration, SHAPED_FROM)  # the rest is steady
-        count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
-        step = length / count
-        every = count + math.ceil(_RINGING / step)
-        times = np.asarray(step * (np.arange(every) + 0.5), dtype=float)
-        values = rise(times, ramp) - rise(np.asarray(times - length), ramp)
-        return cls(np.asarray(values), step, count, length / duration)
-
-    @classmethod
-    def of_course(cls, course: Course) -> "DriveEnvelope":
-        """Build the envelope of a course, with a plain ramp if it starts or ends above 0."""
-        count = math.ceil((course.duration + _RINGING) / course.step)
-        times = np.asarray(course.step * np.arange(count), dtype=float)
-        after, (first, *_, last) = np.asarray(times - course.duration), course.shares
-        values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))
-        values += np.where(after > 0, last * (1 - rise(after, ONSET_RAMP)), 0.0)
-        within = round(STRONGEST / course.step)
-        return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
-
-    def moments(self, squares: FloatArray) -> FloatArray:
-        """Means of squares (n, ...) over the felt time, starting at each step, (n', ...)."""
-        sums = np.cumsum(squares, axis=0, dtype=float)
-        sums[self.within :] -= sums[: -self.within].copy()
-        return np.asarray(sums[self.within - 1 :] / self.within)
-
-    def felt(self, squares: FloatArray, weights: FloatArray) -> OverDuration:
-        """Return the sensation of k fingers from squared amplitudes relative to the threshold (n +
-        1, k, p).
-
-        The last square is that of the steady vibration; weights (k, p): of the points in the mean
-        over a fingertip.
-        """
-        power = self.share * self.moments(squares[:-1]) + (1 - self.share) * squares[-1]
-        own = power if self.is_course else power[:1]
-        felt = (np.sqrt(own) * weights).sum(axis=2).max(axis=0)
-        steady = (np.sqrt(squares[-1]) * weights).sum(axis=1)
-        return OverDuration(felt / np.maximum(steady, 1e-30), power.max(axis=0))
-
-    def shares_at(self, off: FloatArray) -> FloatArray:
-        """Return the fraction (b,) of the steady power in tones at distances (b,) [Hz] from the
-        drive's.
-
-        Together the tones have the energy of the drive on any plate (Parseval); for an envelope,
-        the energy of its strongest moments. Energy between two tones is split in proportion to
-        nearness, but near the drive's own frequency, which can be in a null, by the square of
-        nearness.
-        """
-        count = max(len(self.values), math.ceil(1 / _RESOLUTION / self.step))
-        count = fft.next_fast_len(count)
-        transform, nu = fft.fft(self.values, count), fft.fftfreq(count, self.step)
-        near = np.array([np.interp(nu, off, each) for each in np.eye(len(off))])
-        own = int(np.argmin(np.abs(off)))
-        is_beside = near[own] > 0
-        near[:, is_beside] **= 2
-        near[own, is_beside] += 1 - near[:, is_beside].sum(axis=0)
-        squares = np.abs(fft.ifft((transform * np.sqrt(near)).astype(np.complex64))) ** 2
-        if self.is_course:
-            power, all_ = self.moments(squares.T).max(axis=0), self.moments(self.values**2).max()
-            return np.asarray(power * (all_ / power.sum()))
-        power = self.share * squares.sum(axis=1) / self.within
-        power[own] += 1 - self.share
-        return np.asarray(power)
+        raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(value)}")

@@ -1,9 +1,9 @@
-"""Search for the tones of contents: by a C kernel where it can, and otherwise in numpy.
+"""Search for the tones of contents, in C if the kernel supports the question, else in numpy.
 
-`choose_by_numpy` handles questions that the kernel does not support (durations, envelopes, avoided
-frequencies, the drive mode `switched`) and machines without the kernel. It must give the same
-result: candidates for each content by `model.drive_modes`, evaluated on drawn plates; the promise
-is for the best combination.
+`choose_by_numpy` is the reference for the kernel. It handles questions that the kernel does not
+support (durations, envelopes, avoided frequencies, the drive mode `switched`), and computers
+without the kernel. `model.drive_modes` finds candidates for each content, drawn plates decide
+between them, and the best combination is promised.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,6 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from model.answer.answer import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.answer.fingers_on_plate import (
     CENTRE_AND_FOUR,
     MAX_FINGERS_BY_POINT,
@@ -23,6 +22,7 @@ from model.answer.fingers_on_plate import (
 )
 from model.answer.kernel_question import ask_kernel, is_for_kernel
 from model.answer.promise import promised
+from model.answer.question import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.answer.ringing import RingingUnderFingers, on_drawn_plates
 from model.arrays import (
     Float32Array,
@@ -94,10 +94,10 @@ class _Candidates:
     def of(cls, candidates: Sequence[_Candidate]) -> "_Candidates":
         """Join candidates, in order."""
         return cls(
-            np.array([candidate.content for candidate in candidates]),
-            np.array([candidate.band for candidate in candidates]),
-            np.array([candidate.score for candidate in candidates]),
-            [candidate.drive for candidate in candidates],
+            contents=np.array([candidate.content for candidate in candidates]),
+            bands=np.array([candidate.band for candidate in candidates]),
+            scores=np.array([candidate.score for candidate in candidates]),
+            drives=[candidate.drive for candidate in candidates],
         )
 
     @property
@@ -188,12 +188,12 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     fields = contacts.fields.reshape(len(rows), *points.shape[:2], -1)
     mean = (weights[target] @ fields[:, target])[None]
     forms = Forms(
-        mean,
-        contacts.power.swapaxes(0, 1),
-        contacts.power,
-        table.thresholds.take(rows),
-        float(contents.levels[0]),
-        0.0,
+        targets=mean,
+        target_power=contacts.power.swapaxes(0, 1),
+        quiet=contacts.power,
+        threshold=table.thresholds.take(rows),
+        wanted=float(contents.levels[0]),
+        level_margin=0.0,
     )
     result = search_all(forms)
     order = best_first(result.bound)
@@ -304,12 +304,18 @@ def _candidates_at(
             for search_result in content_search.results(places, groups):
                 is_limited |= search_result.is_limited
                 tone_rows = solved_rows[search_result.places]
-                result = search_result.result
-                chosen = _apart(result.score, frequencies[tone_rows], contents.candidates, apart_hz)
+                scores = search_result.result.score
+                chosen = _apart(scores, frequencies[tone_rows], contents.candidates, apart_hz)
                 for index in chosen:
-                    drive = [(int(tone_rows[index]), result.weights[index])]
-                    score = float(result.score[index])
-                    candidates.append(_Candidate(number, band, score, drive))
+                    weights = search_result.result.weights[index]
+                    candidates.append(
+                        _Candidate(
+                            content=number,
+                            band=band,
+                            score=float(scores[index]),
+                            drive=[(int(tone_rows[index]), weights)],
+                        )
+                    )
     return _Candidates.of(candidates), is_limited
 
 
@@ -409,18 +415,18 @@ def _judged(
         own[indices] = means[indices][:, [*stream.targets]].min(axis=1)
         content_ringing = ringing[number]
         others = contents.others(number)
+        if content_ringing is not None and others and not content_ringing.envelope.is_course:
+            by_energy = own[indices] / np.sqrt(loudest[indices][:, others].max(axis=1))
+            order = indices[best_first(percentile(by_energy))]
+            loudest[order[IN_TIME:]] = _TOO_LOUD
+            best = order[:IN_TIME]
+            best_drives = [candidates.drives[index] for index in best.tolist()]
+            own[best], loudest[best] = _judged_in_time(
+                fingers, content_ringing, stream, best_drives, own[best], loudest[best]
+            )
         if content_ringing is None:
             least[indices] = percentile(own[indices, 1:])
         else:
-            if others and not content_ringing.envelope.is_course:
-                by_energy = own[indices] / np.sqrt(loudest[indices][:, others].max(axis=1))
-                order = indices[best_first(percentile(by_energy))]
-                loudest[order[IN_TIME:]] = _TOO_LOUD
-                best = order[:IN_TIME]
-                best_drives = [candidates.drives[index] for index in best.tolist()]
-                own[best], loudest[best] = _judged_in_time(
-                    fingers, content_ringing, stream, best_drives, own[best], loudest[best]
-                )
             least[indices] = own[indices, 0]
         if len(contents.streams) > 1:
             gain = contents.levels[number] / np.maximum(least[indices], _TINY)

@@ -336,7 +336,7 @@ def _eliminated(
     K = coupled_forces(A, Z, np.eye(len(Z), dtype=np.complex64))
     coupling = np.asarray(Z[:, None] * A * Z, dtype=np.complex64)
     coupling.reshape(len(A), -1)[:, :: len(Z) + 1] += Z
-    moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
+    moved = A @ (K[:, :, :n] * plate.forces[row])
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
 
@@ -377,7 +377,7 @@ def _by_places(
     g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]
     forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
     free = g * shifts
-    couples = np.asarray(w2 * free - ((free @ plate.shapes.T) * Z) @ T)  # (n, 2, r), by 1 N
+    couples = w2 * free - ((free @ plate.shapes.T) * Z) @ T  # (n, 2, r), by 1 N
     left, T = np.zeros_like(couples), T[:n, None]
     along = T.conj() @ gram
     share = (along * couples).sum(axis=2) / (along * T).sum(axis=2)

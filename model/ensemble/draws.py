@@ -143,7 +143,7 @@ def over_fingertips(
     power (c, k p, d): squared amplitudes at points; weights (k, p): of the points in the mean.
     """
     by_finger = power.reshape(len(power), *weights.shape, -1)
-    means = np.asarray((weights[:, None] @ np.sqrt(by_finger))[:, :, 0])
+    means = (weights[:, None] @ np.sqrt(by_finger))[:, :, 0]
     loudest = np.maximum.reduce(by_finger, axis=2)
     return means, np.asarray(loudest)
 

@@ -42,14 +42,14 @@ def expected_power(
 
 def gram(rows: Complex64Array) -> Complex64Array:
     """Return the forms (..., n, n) of sums over rows (..., rows, n)."""
-    return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
+    return rows.conj().swapaxes(-1, -2) @ rows
 
 
 def outer(rows: Complex64Array) -> Complex64Array:
     """Return the forms conj(h) h^T (..., n, n) of rows h (..., n)."""
-    return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
+    return rows.conj()[..., :, None] * rows[..., None, :]
 
 
 def power_of(values: Complex64Array) -> Float32Array:
     """Return squared magnitudes."""
-    return np.asarray(values.real * values.real + values.imag * values.imag)
+    return values.real * values.real + values.imag * values.imag

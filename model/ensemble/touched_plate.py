@@ -142,7 +142,7 @@ class _Fingers:
 
     def under_fingers(self, free: Complex64Array) -> Complex64Array:
         """Fields (c, k, q) at the fingers, from those without fingers."""
-        return np.asarray(self.share @ free)
+        return self.share @ free
 
     def coordinates(self, free: Complex64Array, under_fingers: Complex64Array) -> Complex64Array:
         """Coordinates (c, q, r) with the fingers, from those without and the fields at fingers."""

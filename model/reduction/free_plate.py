@@ -97,14 +97,14 @@ def truncation_weights(
     """
     v, inverse = _interpolation(terms)
     exact = 1 / (1 - largest * shifted_eigenvalue[..., None] * v)
-    return np.asarray(largest * exact @ inverse.T)
+    return largest * exact @ inverse.T
 
 
 def truncation_slopes(shifted_eigenvalue: ComplexArray, largest: float, terms: int) -> ComplexArray:
     """Derivatives of `truncation_weights` by s, (..., terms)."""
     v, inverse = _interpolation(terms)
     exact = 1 / (1 - largest * shifted_eigenvalue[..., None] * v)
-    return np.asarray(largest**2 * (v * exact**2) @ inverse.T)
+    return largest**2 * (v * exact**2) @ inverse.T
 
 
 @lru_cache(maxsize=16)
@@ -153,7 +153,7 @@ class FiniteElementModes:
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
-        return np.asarray(self._matrices.deflection_at(points) @ self._vectors)
+        return self._matrices.deflection_at(points) @ self._vectors
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2)."""
@@ -168,7 +168,7 @@ class FiniteElementModes:
     def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
         (unknowns,) = self.unknowns(points)
-        return np.asarray(self._matrices.deflection_at(others) @ unknowns)
+        return self._matrices.deflection_at(others) @ unknowns
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` in degrees of freedom, in one part."""
@@ -396,7 +396,7 @@ class FreeReceptance:
     def truncated(self, terms: int) -> ComplexArray:
         """Of the first truncated sums, (..., f, terms) [s²/kg]."""
         weights = truncation_weights(self._shifted, self.largest, terms)
-        return np.asarray(weights / self._scale)
+        return weights / self._scale
 
     @cached_property
     def truncated_by_log_q(self) -> ComplexArray:
@@ -404,11 +404,11 @@ class FreeReceptance:
         weights = truncation_weights(self._shifted, self.largest, TERMS)
         slopes = truncation_slopes(self._shifted, self.largest, TERMS)
         z = (self.omega**2 / self.q)[..., None]
-        return np.asarray(-(weights + z * slopes) / self._scale)
+        return -(weights + z * slopes) / self._scale
 
     @property
     def _shifted(self) -> ComplexArray:
-        return np.asarray(self.omega**2 / self.q + self.shift)
+        return self.omega**2 / self.q + self.shift
 
     @property
     def _scale(self) -> ComplexArray:

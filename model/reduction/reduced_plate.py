@@ -338,7 +338,7 @@ class SupportedModes:
                 f"points must be positions on the plate, got {shown(points)}; give x, y in meters, "
                 "as in [[0.1, 0.08]]"
             )
-        return np.asarray(self.reduced.at(places) @ self.coordinates)
+        return self.reduced.at(places) @ self.coordinates
 
 
 def supported_modes(

@@ -186,7 +186,7 @@ class SurfaceModes:
         key = points.shape, points.tobytes()
         if key not in self._known:
             check_footprints_on_plate(points, **self._sides)
-            found = np.asarray(mean_over(self._spline, points, **self._sides))
+            found = mean_over(self._spline, points, **self._sides)
             along = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
             drawn = math.sqrt(2 / _WAVES) * np.cos(along).sum(axis=1)
             while len(self._known) >= _MAX_CACHED:

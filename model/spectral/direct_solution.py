@@ -122,7 +122,7 @@ class AtOneFrequency(SpectralPlate):
             result = (
                 result + full[:m, :m] - full[:m, m:] @ np.linalg.solve(full[m:, m:], full[m:, :m])
             )
-        return np.asarray(result)
+        return result
 
 
 _STEP = 1e-4  # of Poisson's ratio: exact to its square

@@ -396,12 +396,12 @@ def edge_compliance(plate: Plate, side: float, degrees: IntArray, foot: float) -
     decades = np.log10(np.maximum(1, 1 / (2 * plate.thickness * resolved)))
     at_point = bending + decade * decades
     if not foot:
-        return np.asarray(at_point)
+        return at_point
     radii = np.full(len(degrees), foot)
     share, decades = _on_discs(
         np.asarray(math.sqrt(2) * resolved), np.zeros(len(degrees)), radii, radii
     )
-    return np.asarray(np.maximum(bending * share + decade * decades, _ON_FOOT * at_point))
+    return np.maximum(bending * share + decade * decades, _ON_FOOT * at_point)
 
 
 def uncertain_compliance(
@@ -414,7 +414,7 @@ def uncertain_compliance(
     same = (own.footprints[:, None] == other.footprints).all(axis=2)
     points = same & (own.footprints[:, 2] == 0)[:, None]
     decade = np.where(points, np.sqrt(np.multiply.outer(own.decade, other.decade)), 0.0)
-    return np.asarray(_UNCERTAIN * compliance_between(plate, own, other) + decade)
+    return _UNCERTAIN * compliance_between(plate, own, other) + decade
 
 
 def unresolved_at(
@@ -480,14 +480,14 @@ def _edge_excess(z: FloatArray, ratio: float, further: float) -> FloatArray:
     """Mean of exp(-q) (ratio + further (q/2 + q²/4)) over q = z t, t >= 1, weighted with 2 / t³."""
     z = np.maximum(z, 1e-9)
     e1, e2, e3 = (special.expn(order, z) for order in (1, 2, 3))
-    return np.asarray(2 * (ratio * e3 + further * (z / 2 * e2 + z**2 / 4 * e1)))
+    return 2 * (ratio * e3 + further * (z / 2 * e2 + z**2 / 4 * e1))
 
 
 def _decay(z: FloatArray) -> FloatArray:
     """2 ∫ J0(z t) / t³ dt from 1 to infinity."""
     z = np.maximum(z, 1e-9)
     first = special.it2j0y0(z)[0] - np.euler_gamma - np.log(z / 2)  # of J0(z t) / t
-    return np.asarray(special.j0(z) - z / 2 * (special.j1(z) + z * first))
+    return special.j0(z) - z / 2 * (special.j1(z) + z * first)
 
 
 POLYNOMIALS = "Legendre"

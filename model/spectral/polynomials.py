@@ -94,7 +94,7 @@ class EdgedFunctions:
     def polynomial_products(self, values: FloatArray, parity: int) -> FloatArray:
         """Integrals with the polynomials of a parity of functions at `points` (q, m), (n, m)."""
         polynomials = self._values[parity][:, : self.polynomial_count(parity)]
-        return np.asarray(polynomials.T @ (self._weights[:, None] * values))
+        return polynomials.T @ (self._weights[:, None] * values)
 
     @property
     def points(self) -> FloatArray:
@@ -359,7 +359,7 @@ def class_stiffness(
 def _product(left: FloatArray, right: FloatArray) -> FloatArray:
     """Kronecker product of two matrices, as `numpy.kron`, without its checks."""
     shape = len(left) * len(right), left.shape[1] * right.shape[1]
-    return np.asarray((left[:, None, :, None] * right[:, None]).reshape(shape))
+    return (left[:, None, :, None] * right[:, None]).reshape(shape)
 
 
 def along_mass(functions: ClassFunctions, mass: FloatArray, forces: FloatArray) -> FloatArray:

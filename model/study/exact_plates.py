@@ -240,7 +240,7 @@ def accelerations_on(
     forces = coupled_forces(receptance, stiffness, applied.swapaxes(2, 3))
     modal_displacements = modal * (forces.swapaxes(2, 3) @ shapes)
     displacements = modal_displacements @ discs.reshape(-1, discs.shape[-1]).T
-    return np.asarray(-(omega**2)[:, None, None] * displacements)
+    return -(omega**2)[:, None, None] * displacements
 
 
 def _stiffness_of_eras(
@@ -269,7 +269,7 @@ def _stiffness_at_rest(
     for number, foot_factors in zip(feet_of(table.masses), plates.feet.T, strict=True):
         spring = table.masses[number].spring(omega)
         stiffness[:, :, number] += np.multiply.outer(foot_factors - 1, spring)
-    return np.asarray(stiffness)
+    return stiffness
 
 
 def _modal_receptance(nominal: ComplexArray, omega: FloatArray, plates: Plates) -> ComplexArray:
@@ -281,7 +281,7 @@ def _modal_receptance(nominal: ComplexArray, omega: FloatArray, plates: Plates) 
     eigenvalue_factors, size_factors = mode_factors[:, :1], mode_factors[:, None, 1:]
     stiffness = plates.modulus[:, None, None] * eigenvalue_factors * lossy
     receptance = modal_receptance(np.asarray(stiffness, dtype=complex), omega, plates.thickness)
-    return np.asarray(receptance[:, :, None] * size_factors)
+    return receptance[:, :, None] * size_factors
 
 
 def _attachment_shapes(
@@ -298,4 +298,4 @@ def _attachment_shapes(
     plate_count, era_count = displaced.shape[:2]
     displaced_shapes = displaced_shapes.reshape(plate_count, era_count, -1)
     shapes[:, :era_count] += displaced_shapes - table.shapes_at(footprints)
-    return np.asarray(shapes)
+    return shapes

@@ -80,12 +80,12 @@ class WeakCells:
     @property
     def feasible(self) -> NDArray[np.bool_]:
         """Mask (cells,) of feasible cells."""
-        return np.asarray(self.median_db >= WANTED_CONTRAST_DB)
+        return self.median_db >= WANTED_CONTRAST_DB
 
     @property
     def weak(self) -> NDArray[np.bool_]:
         """Mask (cells,) of weak cells."""
-        return np.asarray(self.tenth_db < WANTED_CONTRAST_DB)
+        return self.tenth_db < WANTED_CONTRAST_DB
 
     def as_json(self) -> dict[str, Any]:
         """Return the map for programs; null where a contrast is not finite."""

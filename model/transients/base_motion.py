@@ -41,7 +41,7 @@ Motion: TypeAlias = Sequence[Term]
 
 def rise(times: FloatArray, ramp: float) -> FloatArray:
     """Return a raised cosine at times (n,) [s], from 0 at time 0 to 1 at the end of a ramp [s]."""
-    return np.asarray((1 - np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)
+    return (1 - np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2
 
 
 def raised_cosine(

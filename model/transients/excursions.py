@@ -166,7 +166,7 @@ class MagnetMotions:
             return np.ones(len(frequencies))
         allowed = self.allowed(*frequencies.tolist())
         least: FloatArray = (allowed / self.by_jumps(frequencies)).min(axis=1)
-        return np.asarray(np.minimum(least, 1.0))
+        return np.minimum(least, 1.0)
 
     def by_jumps(self, frequencies: FloatArray) -> FloatArray:
         """Largest motions (f, m) [m] by drives that jump to full level at frequencies [Hz].

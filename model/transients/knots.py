@@ -298,7 +298,7 @@ def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
     """
     rates = plate.eigenvalues.conj()[:, None] + plate.eigenvalues
     shapes = plate.own_acceleration.conj().T @ plate.own_acceleration
-    return np.asarray(shapes * np.expm1(rates * duration) / (rates * duration))
+    return shapes * np.expm1(rates * duration) / (rates * duration)
 
 
 # With this penalty (relative to the mean of the diagonal) and over-relaxation the forms that
@@ -321,7 +321,7 @@ def bounded_minimum(
     to_knots, back = combinations.T, combinations.conj()
 
     def solved(inverse: _ComplexArray, right: _ComplexArray) -> _ComplexArray:
-        return np.asarray((inverse @ right.ravel()).reshape(right.shape) @ to_knots)
+        return (inverse @ right.ravel()).reshape(right.shape) @ to_knots
 
     found = solved(np.linalg.inv(form + _RIDGE * size * unit), right)
     feasible = _within(found)

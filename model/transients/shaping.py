@@ -330,13 +330,13 @@ class Shaper:
             others = self._resting(quiet)
         else:  # the plate beyond 50 mm of all targets, or all of a small plate
             around = self._shapes[is_background(self._centres, targets)]
-            others = np.asarray(around / math.sqrt(len(around)))
+            others = around / math.sqrt(len(around))
         return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
 
     def _quiet_rows(self, positions: tuple[Point, ...]) -> FloatArray:
         """Return rows (d, r) whose sum of squares is the sum of the fingertips' mean squares."""
         weights, shapes = self._fingertips(positions)
-        return np.asarray((np.sqrt(weights)[..., None] * shapes).reshape(-1, shapes.shape[-1]))
+        return (np.sqrt(weights)[..., None] * shapes).reshape(-1, shapes.shape[-1])
 
     def _fingertips(self, positions: tuple[Point, ...]) -> tuple[FloatArray, FloatArray]:
         """Return weights (k, p) of points under fingertips and their shapes (k, p, r)."""

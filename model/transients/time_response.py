@@ -85,7 +85,7 @@ class ForcedVibration:
         # The conjugate of an eigenvector belongs to the conjugate eigenvalue, which LAPACK stores
         # behind each eigenvalue above the real axis; a real one is its own conjugate.
         partner = half + (self.plate.decay.imag > 0)
-        return np.asarray(-0.5j * (z[:, half] - z[:, partner].conj()))
+        return -0.5j * (z[:, half] - z[:, partner].conj())
 
     def acceleration(self, number: int, times: FloatArray, shapes: ComplexArray) -> FloatArray:
         """Return the acceleration (n, p) in a solution at times (n,) [s]; shapes (2 r, p): by z."""
@@ -193,7 +193,7 @@ class PlateInTime:
         for number, era in enumerate(self.eras):
             if era.gains:
                 summed[:, number] *= era.gain(omegas / (2 * np.pi))
-        return np.asarray(summed @ self.participation.T)
+        return summed @ self.participation.T
 
     @cached_property
     def by_drive(self) -> FloatArray:
@@ -223,7 +223,7 @@ class PlateInTime:
     def following_all(self, s: ComplexArray, weights: ComplexArray) -> ComplexArray:
         """Return z (f, 2 r) by weights (f, eras) of all ERAs in full strokes, s (f,) [1/s]."""
         forces = weights * self._bases(s) * (self.by_drive + s[:, None] * self.by_rate)
-        return np.asarray(forces @ self.participation.T / (s[:, None] - self.eigenvalues))
+        return forces @ self.participation.T / (s[:, None] - self.eigenvalues)
 
     def _bases(self, s: ComplexArray) -> ComplexArray:
         """Return the drive of each ERA at full level with its gain, (f, eras)."""
@@ -248,7 +248,7 @@ class PlateInTime:
         """
         numbers = np.flatnonzero(self.eigenvalues.imag >= 0)
         order = np.argsort(-self.eigenvalues.real[numbers], kind="stable")
-        return np.asarray(numbers[order])
+        return numbers[order]
 
     @cached_property
     def decay(self) -> ComplexArray:
@@ -456,4 +456,4 @@ def _held_by(
         applied = (stiffness * by_drive[:, p:])[:, :, None]
         forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]  # (m, k)
         found = found - (forces[:, None] @ moved[:, 2:, :p])[:, 0]
-    return np.asarray(found * (s**2)[:, None])
+    return found * (s**2)[:, None]

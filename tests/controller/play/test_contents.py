@@ -56,7 +56,8 @@ from kit.fingers import (
 from kit.plates import smooth_rig
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
-from model.answer.stimulus import Course, Placement
+from model.answer.envelope import Course
+from model.answer.stimulus import Placement
 from model.config.document import data_text, parse_document
 from model.vibration import Tone
 from registry import threads

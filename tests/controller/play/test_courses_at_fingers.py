@@ -27,8 +27,9 @@ from kit.fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
 from kit.fingers import table as paper_table
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
+from model.answer.envelope import STRONGEST
 from model.answer.plan import answer
-from model.answer.stimulus import STRONGEST, Finger, Stimulus
+from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, Point
 from model.config.fields import Circle, Rectangle
 from model.rig.rig import Rig, Uncertainty

@@ -37,21 +37,11 @@ from model.answer.answer import (
     Limits,
     verdict_of,
 )
+from model.answer.envelope import DriveEnvelope, pulse_ramp, shaped_gain
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer, query
 from model.answer.ringing import RingingUnderFingers, on_drawn_plates
-from model.answer.stimulus import (
-    ANY,
-    BY_NAME,
-    MUST,
-    NEVER,
-    DriveEnvelope,
-    Finger,
-    Placement,
-    Stimulus,
-    pulse_ramp,
-    shaped_gain,
-)
+from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.ensemble.draws import JUDGING_DRAWS, ClockErrors
 from model.finger import THRESHOLDS, detection_threshold, fingertip_points, fingertip_weights

@@ -22,20 +22,12 @@ from kit.plates import (
 )
 from kit.set_table import only, phased, wants
 from model.answer import tone_search
-from model.answer.answer import Contents, Stream
+from model.answer.envelope import Course, DriveEnvelope, pulse_ramp
 from model.answer.plan import answer, query
 from model.answer.promise import share_stroke
+from model.answer.question import Contents, Stream
 from model.answer.ringing import RingingUnderFingers
-from model.answer.stimulus import (
-    Course,
-    DriveEnvelope,
-    Finger,
-    Placement,
-    Stimulus,
-    check_fingers,
-    pulse_ramp,
-    together,
-)
+from model.answer.stimulus import Finger, Placement, Stimulus, check_fingers, together
 from model.answer.tone_search import choose_by_numpy, choose_tones, worst_ratios
 from model.arrays import FloatArray
 from model.ensemble.draws import ClockErrors

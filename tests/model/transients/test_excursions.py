@@ -14,7 +14,7 @@ from scipy.signal import StateSpace, lsim
 
 from cases import shortly
 from kit.plates import exciter_rig, make_paper_rig
-from model.answer.stimulus import swings_of_pulse
+from model.answer.envelope import swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import (
     modal_matrices,

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from controller.play import joint_answers, planner
-from model.answer.answer import NO_LIMITS, Answer, Contents, Layer, Limits, Sensation, Stream, Tones
-from model.answer.answer_levels import scaled
+from model.answer.adjustments import scaled
+from model.answer.answer import NO_LIMITS, Answer, Layer, Limits, Sensation
 from model.answer.plan import answer, prepare_answers, query
+from model.answer.question import Contents, Stream, Tones
 from model.answer.stimulus import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus, together
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors

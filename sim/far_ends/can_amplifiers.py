@@ -62,6 +62,11 @@ class CanAmplifiers(FarEnd):
         for node in self._nodes:
             node.boot(now)
 
+    def close(self) -> None:
+        """Send no more events."""
+        for node in self._nodes:
+            node.close()
+
     @property
     def next_event(self) -> float:
         """Time of the next heartbeat or event [s]."""
@@ -90,6 +95,10 @@ class _Node:
         self._heartbeat_due = 0.0
         self._reset()
         amplifier.listeners.append(self._send_event)
+
+    def close(self) -> None:
+        """Send no more events."""
+        self._amplifier.listeners.remove(self._send_event)
 
     def _reset(self) -> None:
         self._state = _PRE_OPERATIONAL

@@ -12,6 +12,7 @@ identifiers, discovery by broadcast.
 import asyncio
 import re
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, pack_frames, unpack_frames
 from registry import threads
@@ -93,11 +94,14 @@ class BusNodes:
 
     def __init__(self, bus: CanBus, devices: Sequence[AmplifierDevice]) -> None:
         self._bus = bus
+        self._leaving = ExitStack()
+        """Removes the boot listeners."""
         self._nodes = [self._connect(device) for device in devices]
         bus.join(self._hear)
 
     def close(self) -> None:
         """Leave the bus and discard frames in flight."""
+        self._leaving.close()
         self._bus.leave(self._hear)
         for line, served in self._nodes:
             line.close()
@@ -130,6 +134,7 @@ class BusNodes:
         end = CanAmplifiers({device.address: device}, send)
         served = TimedFarEnd(end)
         device.boot_listeners.append(boot)
+        self._leaving.callback(device.boot_listeners.remove, boot)
         boot()
         return line, served
 

@@ -354,16 +354,17 @@ class TerminalEnd:
         self._terminal = make_terminal(self._line.inward.send, unpluggable=unpluggable)
         self.port = self._terminal.port
         """The path of the host's side."""
-        if unpluggable:
-            device.plug_listeners.append(self._plug)
+        self._plug_listeners = device.plug_listeners if unpluggable else []
 
     async def __aenter__(self) -> Self:
         """Serve in the running event loop."""
         self._terminal.listen()
+        self._plug_listeners.append(self._plug)
         return self
 
     async def __aexit__(self, *error: object) -> None:
         """Close."""
+        self._plug_listeners.remove(self._plug)
         self._line.close()
         self._served.close()
         self._terminal.close()
@@ -418,6 +419,7 @@ class TcpEnd:
 
     async def __aexit__(self, *error: object) -> None:
         """Stop listening and close the connections."""
+        self._device.plug_listeners.remove(self._plug)
         self._plug(False)
         if self._server is not None:
             self._server.close()

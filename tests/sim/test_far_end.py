@@ -15,9 +15,13 @@ from pathlib import Path
 import pytest
 
 from drivers.playing import AmplifierTone
+from kit.wires import WIRES, make_bench
 from model.errors import InputError
+from model.rig.rig import Rig
 from registry import threads
 from sim import simulation
+from sim.far_ends.wire_assignment import open_wires
+from sim.faults import FaultWindow
 from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
 
@@ -128,6 +132,26 @@ def test_a_line_has_one_link_and_a_network_none(
     with pytest.raises(InputError, match=text), linked_urls(named, links):
         pass
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
+
+
+def open_files() -> list[Path]:
+    """The file descriptors of this process."""
+    return sorted(Path("/proc/self/fd").iterdir())
+
+
+@pytest.mark.parametrize("scheme", WIRES)
+async def test_far_end_leaves_its_device_when_it_ends(scheme: str, coarse_rig: Rig) -> None:
+    """An unplugged and restarted device opens no line of a far end that has ended."""
+    _, devices = make_bench(coarse_rig)
+    device = devices["main"]
+    async with open_wires({"main": WIRES[scheme]}, [device]):
+        pass
+    present = open_files()
+    for fault in ("unplug", "reboot"):
+        device.inject_fault(FaultWindow(fault=fault))
+        device.recover()
+    assert open_files() == present
+    assert not [*device.plug_listeners, *device.boot_listeners, *device.listeners]
 
 
 def test_missing_firmware_is_told_with_the_remedy(

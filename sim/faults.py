@@ -97,9 +97,12 @@ class Faults:
     ) -> list[tuple[float, bytes]]:
         """Delivered pieces of a frame sent at a time [s], each with its delay [s].
 
-        finds_damage: whether the wire itself discards damaged data, like TCP.
+        No fault changes an empty frame, which ends a connection. finds_damage: whether the wire
+        itself discards damaged data, like TCP.
         """
         pieces = [(0.0, frame)]
+        if not frame:
+            return pieces
         for window in self.windows:
             is_active = self._is_on(window, time) and window.toward in (None, toward)
             if not is_active or self._random.random() >= window.share:

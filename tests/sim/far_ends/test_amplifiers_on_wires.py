@@ -419,6 +419,17 @@ def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
         assert faults.pass_on(FRAME, toward="amplifier", time=time) == [(0.0, FRAME)]
 
 
+@pytest.mark.parametrize("finds_damage", [False, True])
+@pytest.mark.parametrize("kind", ["drop", "delay", "duplicate", "corrupt", "truncate", "hang"])
+def test_end_of_a_connection_passes_when_a_fault_is_active(
+    kind: FaultKind, finds_damage: bool
+) -> None:
+    """Faults change frames; the end of a connection, an empty frame, is none."""
+    faults = Faults([FaultWindow(fault=kind)])
+    passed = faults.pass_on(b"", toward="host", time=1.0, finds_damage=finds_damage)
+    assert passed == [(0.0, b"")]
+
+
 def test_fault_hits_a_share_of_one_direction() -> None:
     """A fifth of the frames to the host; the same seed hits the same ones."""
     one, other = (

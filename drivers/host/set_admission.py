@@ -12,6 +12,7 @@ from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ATTEMPTS, LAYER
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
+    MAX_PARTS,
     PART_WORDS,
     LayerSet,
     command_words,
@@ -123,7 +124,7 @@ class SetAdmission:
         stream = pack_layers(admitted)
         if not self._identification.is_complete and is_vibrating(*admitted):
             raise CommandRefused(f"amplifier {self._name} must be identified first; open it again")
-        max_words = ledger.capabilities["set_words"]
+        max_words = min(ledger.capabilities["set_words"], MAX_PARTS * PART_WORDS)
         if len(stream) > max_words:
             raise CommandRefused(f"a set must have at most {max_words} words, got {len(stream)}")
         return _CheckedSet(layers, admitted, stream, delay, now + valid_for)

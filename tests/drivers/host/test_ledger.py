@@ -13,12 +13,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import starmap
 from types import EllipsisType
+from unittest.mock import Mock
 
 import pytest
 
 from drivers.errors import CommandError, CommandRefused, LinkTimeout
 from drivers.host.ledger import Ledger
 from drivers.host.requests import Job, Priority
+from drivers.host.set_admission import SetAdmission
 from drivers.playing import AmplifierLayer, AmplifierTone, Playback
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames
@@ -100,6 +102,17 @@ def test_tone_that_must_not_be_played_is_refused_with_its_channel(case: str) -> 
 def test_layer_that_cannot_be_is_refused(layer: AmplifierLayer) -> None:
     """Numbers, times and flags of a layer, and a channel twice."""
     refusal(Ledger(WIDE, CAN), layer)
+
+
+def test_set_of_more_than_127_parts_is_refused() -> None:
+    """127 parts of 117 words carry 14 859 words, fewer than an amplifier may accept."""
+    shape = Envelope(100, ((100, 0),) * 32)
+    tones = tuple(tone(channel, 0.01, onset=shape, ending=shape) for channel in range(16))
+    layers = [AmplifierLayer(number, tones) for number in range(16)]
+    can = {**capabilities(16), "layers": 16, "voices": 255, "set_words": 65535}
+    admission = SetAdmission("a", Mock(is_complete=True))
+    refused = admission.refusal_of(layers, Ledger(WIDE, can), 0.0, set_time=0.0)
+    assert "a set must have at most 14859 words, got" in str(refused)
 
 
 def test_values_are_rounded_to_the_safe_side() -> None:

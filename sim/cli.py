@@ -117,8 +117,8 @@ def sim(
         from model.rig.rig_file import load_rig
         from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
         from sim.simulation import Simulation, find_firmware
-        from sim.transport.far_end import links_by_amplifier
         from sim.transport.simulated_line import PROMPT
+        from sim.transport.terminal_links import links_by_amplifier
 
         plate_seed = seed_of_plate(exact=exact, seed=seed)
         defaults = SimulatedWire(

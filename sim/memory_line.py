@@ -170,13 +170,9 @@ class MemoryPort:
         self._on_data = on_data
         self._on_loss = on_loss
         amplifiers = {device.address: device for device in devices}
-        self._end = SerialAmplifiers(amplifiers, lambda data: self._wire.outward.send(data))
-        self._wire = TwoWayLine(
-            to_amplifier=self._end.receive,
-            to_host=self._deliver,
-            faults=self._first.faults,
-            delays=delays,
-        )
+        self._wire = TwoWayLine(self._deliver, faults=self._first.faults, delays=delays)
+        self._end = SerialAmplifiers(amplifiers, self._wire.outward.send)
+        self._wire.to_amplifier = self._end.receive
         self.running = contextlib.AsyncExitStack()
         """Contexts that end with the port."""
         self._is_open = True

@@ -30,7 +30,7 @@ from sim.control import SimulationContext, control_socket, in_background
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
 from sim.plant.imperfections import Imperfections
-from sim.transport.far_end import linked_urls
+from sim.transport.terminal_links import linked_urls
 
 FIRMWARE_FOLDER = Path(__file__).parents[1] / "out" / "firmware"
 """Where `make firmware` puts its programs."""

@@ -23,7 +23,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.voices import Voice
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.far_end import make_terminal
+from sim.transport.pseudo_terminal import make_terminal
 
 STEP = 0.005  # s; update interval of a fading tone
 HEARTBEAT = 0.05  # s; longest interval between heartbeats to the watchdog process

@@ -18,7 +18,8 @@ from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, pack_frames, u
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_amplifiers import CanAmplifiers
-from sim.transport.far_end import FarEnd, SendBytes, TimedFarEnd
+from sim.transport.far_end import FarEnd, SendBytes
+from sim.transport.serving import TimedFarEnd
 from sim.transport.simulated_line import TwoWayLine
 
 BUS_NAME = "can0"
@@ -125,14 +126,10 @@ class BusNodes:
             end.start(threads.now())
             served.schedule()
 
-        line = TwoWayLine(
-            to_amplifier=lambda data, now: served.receive(data, now),
-            to_host=self._send_to_bus,
-            faults=device.faults,
-            finds_damage=True,
-        )
+        line = TwoWayLine(self._send_to_bus, faults=device.faults, finds_damage=True)
         end = CanAmplifiers({device.address: device}, send)
         served = TimedFarEnd(end)
+        line.to_amplifier = served.receive
         device.boot_listeners.append(boot)
         self._leaving.callback(device.boot_listeners.remove, boot)
         boot()

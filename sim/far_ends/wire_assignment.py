@@ -27,7 +27,8 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.far_ends.simulated_bus import BUS_NAME, BusNodes, CanBus, SlcanAdapter, SocketcandClient
 from sim.faults import Faults
-from sim.transport.far_end import HOST, FarEnd, MakeEnd, SendBytes, TcpEnd, TerminalEnd
+from sim.transport.far_end import FarEnd, SendBytes
+from sim.transport.serving import HOST, MakeEnd, TcpEnd, TerminalEnd
 from sim.transport.simulated_line import LINE_NAMES, PROMPT, delays_of
 
 Urls = AsyncIterator[Mapping[str, str]]

@@ -109,7 +109,7 @@ def terminal_place(link: Path | None) -> Iterator[SoftAmplifierLine]:
     """A pseudo-terminal, and a symbolic link to it in this context; raises InputError."""
     import tty  # not on Windows
 
-    from sim.transport.far_end import linked  # loads asyncio, which the help does without
+    from sim.transport.terminal_links import linked  # loads asyncio, which the help does without
 
     with ExitStack() as stack:
         near, far = os.openpty()

@@ -246,19 +246,22 @@ class SimulatedLine:
 class TwoWayLine:
     """Both directions: `inward` to the amplifier, `outward` to the host; see `SimulatedLine`.
 
-    to_amplifier: called with frames and times [s]; to_host: with frames; delays: None for none.
+    to_host: called with the frames for the host; delays: None for none.
     """
+
+    to_amplifier: Callable[[bytes, float], None]
+    """Called with the frames for the amplifier, and when [s] they arrive; set before the first."""
 
     def __init__(
         self,
-        *,
-        to_amplifier: Callable[[bytes, float], None],
         to_host: Callable[[bytes], None],
+        *,
         faults: Faults,
         delays: LineDelays | None = None,
         byte_time: float = 0.0,
         finds_damage: bool = False,
     ) -> None:
+        self._to_host = to_host
         make = partial(
             SimulatedLine,
             faults=faults,
@@ -266,10 +269,16 @@ class TwoWayLine:
             byte_time=byte_time,
             finds_damage=finds_damage,
         )
-        self.inward = make(to_amplifier, toward="amplifier")
-        self.outward = make(lambda data, now: to_host(data), toward="host")
+        self.inward = make(self._reach_amplifier, toward="amplifier")
+        self.outward = make(self._reach_host, toward="host")
 
     def close(self) -> None:
         """Discard the frames in flight."""
         self.inward.close()
         self.outward.close()
+
+    def _reach_amplifier(self, frame: bytes, now: float) -> None:
+        self.to_amplifier(frame, now)
+
+    def _reach_host(self, frame: bytes, now: float) -> None:
+        self._to_host(frame)

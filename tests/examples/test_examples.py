@@ -57,7 +57,7 @@ from processes.typed_page import Reader, installed_program, read_steps
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.far_end import make_terminal
+from sim.transport.pseudo_terminal import make_terminal
 
 ROOT = Path(__file__).parents[2]
 PLUGINS = ROOT / "examples" / "plugins"

@@ -22,8 +22,8 @@ from registry import threads
 from sim import simulation
 from sim.far_ends.wire_assignment import open_wires
 from sim.faults import FaultWindow
-from sim.transport.far_end import linked_urls, links_by_amplifier
 from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
+from sim.transport.terminal_links import linked_urls, links_by_amplifier
 
 HALF_STROKE = AmplifierTone(0, 110.0, 0.5)
 

@@ -43,7 +43,8 @@ from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.far_ends.simulated_bus import CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import Faults
-from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd
+from sim.transport.far_end import FarEnd
+from sim.transport.serving import TcpEnd, TerminalEnd
 
 PER_SECOND = 214_748_364.8
 

@@ -44,7 +44,7 @@ from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.far_end import TERMINAL_MAKER, PseudoTerminal
+from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -51,7 +51,7 @@ from sim.far_ends.simulated_bus import BusNodes, CanBus, SlcanAdapter, Socketcan
 from sim.far_ends.wire_assignment import FAR_ENDS, SimulatedWire, open_wires
 from sim.faults import Faults
 from sim.plant.imperfections import Imperfections
-from sim.transport.far_end import TcpEnd, TerminalEnd
+from sim.transport.serving import TcpEnd, TerminalEnd
 
 
 @dataclass

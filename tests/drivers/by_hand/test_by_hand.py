@@ -62,7 +62,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> None:
         "by_hand.actions.BOOT_TIME",
         "wires.modbus.BOOT_TIME",
         "wires.serial_line.SerialAddress.boot_time",
-        "wires.can_bus.SlcanAddress.boot_time",
+        "wires.can_text.SlcanAddress.boot_time",
     ):
         monkeypatch.setattr(f"drivers.{place}", 0.5)
 

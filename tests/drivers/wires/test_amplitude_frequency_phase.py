@@ -25,8 +25,9 @@ from drivers.host.requests import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope
-from drivers.wires.can_bus import BusPort, CanWire
+from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CanFrame, pack_frames
+from drivers.wires.can_interfaces import BusPort
 from kit.clock import run_virtual
 from kit.wires import LIMITS, WIRES, rig_on_wire
 from model.rig.rig import Rig

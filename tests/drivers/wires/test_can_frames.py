@@ -23,8 +23,7 @@ from drivers.ports import PORT_OPENER
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
-from drivers.wires import can_bus
-from drivers.wires.can_bus import BusPort, Outbox, SlcanAddress, TextPort
+from drivers.wires import can_interfaces, can_text
 from drivers.wires.can_frames import (
     SLCAN,
     SOCKETCAND,
@@ -38,6 +37,8 @@ from drivers.wires.can_frames import (
     segments,
     unpack_frames,
 )
+from drivers.wires.can_interfaces import BusPort, Outbox
+from drivers.wires.can_text import SlcanAddress, TextPort
 from drivers.wires.wire import address_of
 from kit.clock import in_virtual_time
 from kit.courses import Taken, courses, follow
@@ -297,13 +298,13 @@ async def test_thread_sends_a_stop_next_after_a_call_that_hangs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """On a real interface only the broadcast stays ahead of it; the rest of the set is dropped."""
-    monkeypatch.setattr(can_bus, "FULL_TIMEOUT", 60.0)
+    monkeypatch.setattr(can_interfaces, "FULL_TIMEOUT", 60.0)
     bus = {"interface": "hanging", "channel": "stop first"}
     with (
         hanging_interface() as adapter,
         can.Bus(interface="virtual", channel="stop first") as other,
     ):
-        port = await can_bus.open_bus("can0", bus, lambda data: None, pytest.fail)
+        port = await can_interfaces.open_bus("can0", bus, lambda data: None, pytest.fail)
         adapter.hangs = True
         for name in ("burst", "commit", "burst"):
             port.write(pack_frames(FRAMES[name]))
@@ -415,7 +416,7 @@ async def test_server_that_does_not_open_the_bus_is_told(
     replies: tuple[bytes, ...], problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error, a closed connection, or no reply at all: with the remedy."""
-    monkeypatch.setattr(can_bus, "GREETING_TIMEOUT", 0.2)
+    monkeypatch.setattr(can_text, "GREETING_TIMEOUT", 0.2)
     async with server(*replies) as url:
         with pytest.raises(LinkError, match=rf"(?s){problem}.*check address and port"):
             await open_port(url, lambda data: None)

@@ -32,9 +32,9 @@ from drivers import ports
 from drivers.errors import CommandError, LinkError
 from drivers.ports import Port
 from drivers.urls import Endpoint
-from drivers.wires import can_bus, modbus_frames
-from drivers.wires.can_bus import PythonCanAddress
+from drivers.wires import can_interfaces, modbus_frames
 from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, TextReader
+from drivers.wires.can_interfaces import PythonCanAddress
 from drivers.wires.modbus import ModbusWire, SilentPort
 from drivers.wires.modbus_frames import (
     Adu,
@@ -455,7 +455,9 @@ async def test_close_does_not_wait_for_a_device_that_hangs(
         opened: Port = await ports.open_port(place, heard.append, lambda what: None)
     else:
         how = {"interface": "pcan"}
-        opened = await can_bus.open_bus("can+python-can://pcan/usb", how, heard.append, print)
+        opened = await can_interfaces.open_bus(
+            "can+python-can://pcan/usb", how, heard.append, print
+        )
     opened.close()
     with caplog.at_level(logging.WARNING, "drivers"):
         await asyncio.wait_for(opened.wait_closed(), 30)

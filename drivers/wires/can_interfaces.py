@@ -10,10 +10,12 @@ import asyncio
 import contextlib
 import errno
 import logging
+import re
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, final
 
@@ -26,16 +28,39 @@ from drivers.wires.can_bus import NODE_FORM, CanAddress
 from drivers.wires.can_frames import ERROR_ID, REQUEST, CanFrame, pack_frames, unpack_frames
 from registry.threads import in_thread
 
-_WATCHED = ("socketcan", "udp_multicast")
-"""Interfaces with a file descriptor for the event loop: `recv` of the others may block."""
 
-_SENDS_AT_ONCE = ("socketcan",)
-"""Interfaces whose `send` never blocks without a timeout."""
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """What an interface of python-can does in its own way."""
+
+    is_watched: bool = False
+    """Whether it has a file descriptor for the event loop: `recv` of the others may block."""
+    sends_at_once: bool = False
+    """Whether its `send` never blocks without a timeout."""
+    full_code: int | None = None
+    """Code of the error that `send` raises for a full transmit queue; None without a code."""
+    bus_off: int = 0
+    """Bit of an error frame's identifier that reports bus-off; 0 without one."""
+
+
+_BUS_OFF = 0x40  # CAN_ERR_BUSOFF of linux/can/error.h
+_INTERFACES: Mapping[str, Interface] = {
+    "socketcan": Interface(
+        is_watched=True, sends_at_once=True, full_code=errno.ENOBUFS, bus_off=_BUS_OFF
+    ),
+    "udp_multicast": Interface(is_watched=True),
+    "gs_usb": Interface(bus_off=_BUS_OFF),  # its protocol is that of the driver of Linux
+    "kvaser": Interface(full_code=-13),  # canERR_TXBUFOFL
+    "systec": Interface(full_code=11),  # USBCAN_ERR_DLL_TXFULL
+    "usb2can": Interface(full_code=9),  # CANAL_ERROR_FIFO_FULL
+    "vector": Interface(full_code=11),  # XL_ERR_QUEUE_IS_FULL
+}
+"""Interfaces that differ from the default."""
+_FULL = re.compile(r"transmit (queue|buffer)\b.*\bfull", re.IGNORECASE)
+"""Text for a full queue without a code: of SocketCAN, and of PCAN's library in English."""
 
 _READ_TIMEOUT = 0.05  # s; interval in which a reader thread notices its end
 _READS = 64  # frames per iteration, so that a flood does not block the event loop
-_BUS_OFF = 0x40  # error class of SocketCAN
-_FULL = "Transmit buffer full"  # of python-can, if the socket's buffer is full
 _FULL_PAUSE = 0.0005  # s; before frames are sent again to a full transmit queue
 FULL_TIMEOUT = 0.03  # s; without progress, after which frames are dropped as too old
 
@@ -78,15 +103,8 @@ async def open_bus(
         raise LinkError(
             f"CAN bus {name} cannot be opened: {remedy} (system error: {system_message(problem)})"
         ) from problem
-    interface = bus["interface"]
-    return BusPort(
-        opened,
-        name,
-        on_data,
-        on_loss,
-        is_watched=interface in _WATCHED,
-        sends_at_once=interface in _SENDS_AT_ONCE,
-    )
+    interface = _INTERFACES.get(bus["interface"], Interface())
+    return BusPort(opened, name, on_data, on_loss, interface)
 
 
 class Outbox:
@@ -139,10 +157,9 @@ class Outbox:
 class BusPort(DevicePort):
     """A bus of python-can; implements `Port`.
 
-    is_watched: whether the event loop watches the bus for frames, otherwise a thread reads it;
-    sends_at_once: whether `send` of the interface never blocks, otherwise a thread calls it, so
-    that an adapter that hangs delays neither a stop on another line nor a heartbeat. on_data:
-    called with packed frames.
+    The event loop watches the bus, and sends frames, where the interface allows it; otherwise
+    threads do, so that an adapter that hangs delays neither a stop on another line nor a heartbeat.
+    on_data: called with packed frames.
     """
 
     kind = "CAN bus"
@@ -154,18 +171,17 @@ class BusPort(DevicePort):
         name: str,
         on_data: Callable[[bytes], None],
         on_loss: Callable[[str], None],
-        *,
-        is_watched: bool,
-        sends_at_once: bool,
+        interface: Interface,
     ) -> None:
         self._bus = bus
+        self._interface = interface
         self.outbox = Outbox()
         self._outbox_changed = threading.Condition()  # its lock guards the outbox
-        self._sends_at_once = sends_at_once
         self._is_blocked = False
         self._timer: asyncio.TimerHandle | None = None
-        super().__init__(name, bus.fileno() if is_watched else None, on_data, on_loss, bus.shutdown)
-        if not sends_at_once:
+        descriptor = bus.fileno() if interface.is_watched else None
+        super().__init__(name, descriptor, on_data, on_loss, bus.shutdown)
+        if not interface.sends_at_once:
             self.start_thread(self._send_in_thread, name=f"era-send {name}")
 
     @property
@@ -180,7 +196,7 @@ class BusPort(DevicePort):
         with self._outbox_changed:
             self.outbox.put(unpack_frames(data), self.loop.time())
             self._outbox_changed.notify()
-        if self._sends_at_once:
+        if self._interface.sends_at_once:
             self._send()
 
     def read_watched(self) -> bytes:
@@ -191,7 +207,7 @@ class BusPort(DevicePort):
                 message = self._bus.recv(timeout=0)
                 if message is None:
                     break
-                frames += _frames(message)
+                frames += self._frames(message)
         except self.failures:
             self.received(pack_frames(frames))
             raise
@@ -200,7 +216,7 @@ class BusPort(DevicePort):
     def read_waiting(self) -> bytes:
         """Return the frame that comes within a short time."""
         message = self._bus.recv(timeout=_READ_TIMEOUT)
-        return b"" if message is None else pack_frames(_frames(message))
+        return b"" if message is None else pack_frames(self._frames(message))
 
     def close(self) -> None:
         """Stop reading and writing; `wait_closed` closes the bus."""
@@ -256,26 +272,34 @@ class BusPort(DevicePort):
         )
         try:
             self._bus.send(message)
-        except can.CanOperationError as error:
-            if error.error_code == errno.ENOBUFS or _FULL in str(error):
+        except can.CanError as error:
+            if self._is_full(error):
                 return False
             raise
         self._is_blocked = False
         return True
 
+    def _is_full(self, error: can.CanError) -> bool:
+        """Whether an error of `send` reports a full transmit queue."""
+        code = error.error_code
+        if code is None:  # systec: in the cause
+            code = getattr(error.__cause__, "error_code", None)
+        if code is not None and code == self._interface.full_code:
+            return True
+        return isinstance(error, can.CanTimeoutError) or _FULL.search(str(error)) is not None
 
-def _frames(message: can.Message) -> list[CanFrame]:
-    """Return the data frame with an 11-bit identifier that a message is, if it is one.
+    def _frames(self, message: can.Message) -> list[CanFrame]:
+        """Return the data frame with an 11-bit identifier that a message is, if it is one.
 
-    For an error frame, its class is reported; OSError if the adapter is off the bus.
-    """
-    if message.is_error_frame and message.arbitration_id & _BUS_OFF:
-        raise OSError("the adapter went bus-off; check wiring, termination and bit rate")
-    if message.is_error_frame:
-        return [CanFrame(ERROR_ID, bytes([message.arbitration_id & 0xFF]))]
-    if message.is_remote_frame or message.is_extended_id:
-        return []
-    return [] if message.is_fd else [CanFrame(message.arbitration_id, bytes(message.data))]
+        For an error frame, its class is reported; OSError if the adapter is off the bus.
+        """
+        if message.is_error_frame and message.arbitration_id & self._interface.bus_off:
+            raise OSError("the adapter went bus-off; check wiring, termination and bit rate")
+        if message.is_error_frame:
+            return [CanFrame(ERROR_ID, bytes([message.arbitration_id & 0xFF]))]
+        if message.is_remote_frame or message.is_extended_id or message.is_fd:
+            return []
+        return [CanFrame(message.arbitration_id, bytes(message.data))]
 
 
 def _shut(bus: can.BusABC) -> None:

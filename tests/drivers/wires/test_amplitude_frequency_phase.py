@@ -27,7 +27,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CanFrame, pack_frames
-from drivers.wires.can_interfaces import BusPort
+from drivers.wires.can_interfaces import BusPort, Interface
 from kit.clock import run_virtual
 from kit.wires import LIMITS, WIRES, rig_on_wire
 from model.rig.rig import Rig
@@ -288,7 +288,8 @@ async def group_behind_python_can(sent: bytearray) -> AsyncIterator[Group]:
         loop.call_soon(far_end.receive, frames, loop.time())
 
     bus = Mock(send=send, recv=lambda timeout: None, fileno=lambda: read_end)
-    port = BusPort(bus, "can0", line.received, pytest.fail, is_watched=True, sends_at_once=True)
+    interface = Interface(is_watched=True, sends_at_once=True)
+    port = BusPort(bus, "can0", line.received, pytest.fail, interface)
     line.open(port)
     group = Group({"main": Amplifier(line, 1, LIMITS, name="main")})
     try:

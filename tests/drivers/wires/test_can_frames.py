@@ -10,7 +10,7 @@ import errno
 import os
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest.mock import AsyncMock, Mock
 
@@ -37,7 +37,7 @@ from drivers.wires.can_frames import (
     segments,
     unpack_frames,
 )
-from drivers.wires.can_interfaces import BusPort, Outbox
+from drivers.wires.can_interfaces import BusPort, Interface, Outbox
 from drivers.wires.can_text import SlcanAddress, TextPort
 from drivers.wires.wire import address_of
 from kit.clock import in_virtual_time
@@ -187,6 +187,8 @@ def test_frames_make_the_message_that_was_sent_or_none(case: str) -> None:
     assert counters.invalid_frames == invalid
 
 
+SOCKETCAN = Interface(is_watched=True, sends_at_once=True, full_code=105, bus_off=0x40)
+"""ENOBUFS of Linux, and CAN_ERR_BUSOFF of linux/can/error.h."""
 BURST = [CanFrame(0x201, bytes([number])) for number in range(22)]
 COMMIT = [CanFrame(0x200, b"commit")]
 FRAMES = {
@@ -220,13 +222,11 @@ class Adapter(can.BusABC):
 
 @asynccontextmanager
 async def opened(
-    heard: Callable[[bytes], None] = lambda data: None, *, is_watched: bool = True
+    heard: Callable[[bytes], None] = lambda data: None, interface: Interface = SOCKETCAN
 ) -> AsyncIterator[tuple[BusPort, Adapter, list[str]]]:
     """A port, its adapter, and its losses; heard: called with what it receives."""
     adapter, losses = Adapter(), list[str]()
-    port = BusPort(
-        adapter, "can0", heard, losses.append, is_watched=is_watched, sends_at_once=is_watched
-    )
+    port = BusPort(adapter, "can0", heard, losses.append, interface)
     try:
         yield port, adapter, losses
     finally:
@@ -282,7 +282,8 @@ def test_port_of_a_bus_keeps_to_its_course(name: str) -> None:
 async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gone() -> None:
     """Frames that came before are handed over first; the thread ends, and the loss is told once."""
     heard: list[bytes] = []
-    async with opened(heard.append, is_watched=False) as (port, adapter, losses):
+    reads_in_thread = replace(SOCKETCAN, is_watched=False, sends_at_once=False)
+    async with opened(heard.append, reads_in_thread) as (port, adapter, losses):
         port.poll()  # left to the thread
         frames = [CanFrame(0x181, bytes([number])) for number in range(3)]
         adapter.incoming += [
@@ -292,6 +293,68 @@ async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gon
         await until(lambda: bool(losses))
         assert heard == [pack_frames([frame]) for frame in frames]
     assert len(losses) == 1
+
+
+def _caused_by(cause: can.CanError) -> can.CanError:
+    error = can.CanOperationError()
+    error.__cause__ = cause
+    return error
+
+
+FULL: dict[str, can.CanError] = {
+    "socketcan": can.CanOperationError("Transmit buffer full"),
+    "socketcan queue": can.CanOperationError("Failed to transmit", errno.ENOBUFS),
+    "pcan": can.CanOperationError("Failed to send: The transmit queue is full."),
+    "pcan controller": can.CanOperationError("Transmit buffer in CAN controller is full"),
+    "kvaser": can.CanOperationError("Function canWrite failed", -13),
+    "vector": can.CanOperationError("xlCanTransmit failed", 11),
+    "systec": _caused_by(can.CanError("Function UcanWriteCanMsgEx", 11)),
+    "usb2can": can.CanOperationError("could not send message", 9),
+    "ixxat": can.CanTimeoutError("Function canChannelSendMessage"),
+}
+"""The error of python-can 4.6 and of the vendor's library for a full transmit queue."""
+
+
+async def losses_after(
+    interface: str, error: can.CanError, monkeypatch: pytest.MonkeyPatch
+) -> list[str]:
+    """Send a frame to a bus whose first `send` fails; returns the losses once it is sent again."""
+    adapter, losses = Adapter(), list[str]()
+    send = Mock(side_effect=[error, None])
+    monkeypatch.setattr(adapter, "send", send)
+    monkeypatch.setattr(can, "Bus", Mock(return_value=adapter))
+    monkeypatch.setattr(can_interfaces, "FULL_TIMEOUT", 60.0)
+    bus = {"interface": interface, "channel": 0, "bitrate": 500_000}
+    port = await can_interfaces.open_bus("can0", bus, lambda data: None, losses.append)
+    with suppress(LinkError):
+        port.write(pack_frames(FRAMES["stop"]))
+    await until(lambda: send.call_count == 2 or bool(losses))
+    port.close()
+    await port.wait_closed()
+    for each in adapter.ends:
+        os.close(each)
+    return losses
+
+
+@pytest.mark.parametrize("case", FULL)
+async def test_full_queue_of_any_interface_is_no_loss(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frame is sent again once there may be room."""
+    assert await losses_after(case.split()[0], FULL[case], monkeypatch) == []
+
+
+async def test_code_of_another_interface_is_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """11 is a full queue of Vector, and any error of another interface."""
+    assert len(await losses_after("gs_usb", FULL["vector"], monkeypatch)) == 1
+
+
+async def test_only_error_frames_of_linux_report_bus_off() -> None:
+    """Other interfaces have their own identifiers of error frames."""
+    async with opened(interface=Interface(is_watched=True)) as (port, adapter, losses):
+        adapter.incoming.append(can.Message(arbitration_id=0x40, is_error_frame=True))
+        port.poll()
+        assert not losses
 
 
 async def test_thread_sends_a_stop_next_after_a_call_that_hangs(

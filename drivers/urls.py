@@ -46,34 +46,20 @@ KIND_OF_PORT: Mapping[str, str] = {
     "ttySC": "native",
 }
 """Kind of line by the name of a serial port without its number."""
-KIND_OF_SCHEME: Mapping[str, str] = {
-    "serial+tcp": "ethernet",
-    "modbus+tcp": "ethernet",
-    "can+socketcand": "ethernet",
-    "can+socketcan": "can",
-    "can+python-can": "can",
-    "can+slcan": "can-usb",
-    "sim": SIMULATED,
-}
-"""Kind of line by the scheme of a URL without a serial port."""
-SCHEMES_OF_PORTS: Final = ("serial", "modbus+rtu")
-"""Schemes of URLs that name a serial port."""
 UNKNOWN_KIND: Final = "usb-full-speed"
 """Kind of line assumed for other port names and for schemes of plug-ins."""
 
 
-def line_kind_of(url: str) -> str:
-    """Return the kind of line of an amplifier's URL; a key of `CLOCK_ERRORS` if it is valid."""
-    scheme, _, location = url.partition("://")
-    scheme = scheme.lower()
-    query = location.partition("?")[2].partition("#")[0]
-    stated_kind = dict(parse_qsl(query)).get("line")
-    if stated_kind:
-        return stated_kind
-    if scheme not in SCHEMES_OF_PORTS:
-        return KIND_OF_SCHEME.get(scheme, UNKNOWN_KIND)
-    port = re.match(r"/dev/([a-zA-Z]+)\d", location)
+def kind_of_device(path: str) -> str:
+    """Return the kind of line of a serial port."""
+    port = re.match(r"/dev/([a-zA-Z]+)\d", path)
     return KIND_OF_PORT.get(port[1], UNKNOWN_KIND) if port else UNKNOWN_KIND
+
+
+def stated_kind(url: str) -> str:
+    """Return the kind of line that an amplifier's URL states; empty if it states none."""
+    query = url.partition("?")[2].partition("#")[0]
+    return dict(parse_qsl(query)).get("line", "")
 
 
 ADDRESS: Final = 1
@@ -206,19 +192,7 @@ class AmplifierUrl:
         return self.whole_option("baud", default, _BAUD_MAX)
 
 
-def with_address(url: str, address: int) -> str:
-    """Return the URL with another address, unit or node; CommandError for a wire without any."""
-    scheme = url.partition("://")[0]
-    if scheme in ("serial", "serial+tcp"):
-        without_address = re.sub(r"(?<=[?&])address=\d+&?", "", url).rstrip("?&")
-        separator = "&" if "?" in without_address else "?"
-        return f"{without_address}{separator}address={address}"
-    if scheme == "modbus+tcp":
-        location, _, options = url.partition("?")
-        host = "/".join(location.split("/")[:3])
-        query = f"?{options}" if options else ""
-        return f"{host}/{address}{query}"
-    if scheme == "modbus+rtu" or scheme.startswith("can"):
-        without_number = url.rpartition("#")[0] or url
-        return f"{without_number}#{address}"
-    raise CommandError(f"amplifiers at {url} have no address that can be set")
+def with_fragment(url: str, number: int) -> str:
+    """Return the URL with another number behind `#`."""
+    without_number = url.rpartition("#")[0] or url
+    return f"{without_number}#{number}"

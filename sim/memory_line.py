@@ -9,16 +9,17 @@ the delays of a USB adapter where a rig has several amplifiers. Not modeled: tra
 import asyncio
 import contextlib
 import random
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import ClassVar
 from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
 from drivers.errors import CommandError, LinkError
 from drivers.urls import SIMULATED, AmplifierUrl
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import WireAddress
+from drivers.wires.wire import Scheme, WireAddress
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -215,6 +216,20 @@ class MemoryPort:
 
 class SimulatedAddress(WireAddress):
     """An amplifier of a rig simulated in this process, alone on its line; see `SimulationUrl`."""
+
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {
+        "sim": Scheme(
+            line_kind=SIMULATED,
+            example="sim://RIG.yaml",
+            help="a simulated amplifier of a rig",
+            number="`?amplifier=NAME`",
+            forms={
+                "sim://RIG": "`seed` 0 or `exact`, `control`: [simulated hardware]"
+                "(../how-to/simulated-hardware.md). In a rig file, `sim://` alone simulates this "
+                "rig"
+            },
+        )
+    }
 
     def __init__(self, url: str) -> None:
         self._url = SimulationUrl(url)

@@ -16,6 +16,7 @@ import changed_tests
 import client_stub
 import effects_page
 import rig_page
+import urls_page
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from amplifier_json import json_text
@@ -75,7 +76,13 @@ def _of_protocol(page: str) -> list[Writer]:
     return [*tables, *_parts("protocol_bytes.py", BYTES.get(page, {}))]
 
 
+def _urls(name: str) -> list[Writer]:
+    return _parts("urls_page.py", {name: urls_page.PARTS[name]})
+
+
 WRITTEN: Mapping[str, Sequence[Writer]] = {
+    "drivers/wires/wire.py": _urls("classes"),
+    "drivers/by_hand/cli.py": _urls("help"),
     "controller/api/summaries.py": [whole(summaries)],
     **{
         f"controller/api/{module}.py": _parts("client_stub.py", parts)
@@ -105,6 +112,8 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/reference/errors.md": [error_cases.with_messages],
     "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),
     "docs/reference/effects.md": _parts("effects_page.py", effects_page.PARTS),
+    "docs/reference/urls.md": _urls("urls"),
+    "docs/how-to/simulated-hardware.md": _urls("far_ends"),
     "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
 }
 """The writers of each file, by its path from the root."""

@@ -42,7 +42,7 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values, bits_of
 from drivers.protocol.sets import token_after
-from drivers.urls import with_address
+from drivers.wires.wire import with_address
 from registry import threads
 from registry.limits import GuardLimits
 from registry.threads import LoopThread

@@ -21,24 +21,31 @@ EXIT_STATUS: dict[type[BaseException], int] = {
     FrameError: 3,
 }
 
+# begin: written by docs/generators/urls_page.py help
+
 # \b: these lines stay as they are.
-_URLS = """\b
+_URL_HELP = """\b
 URLs:
   serial:///dev/ttyUSB0?baud=921600&address=1   a serial port
   serial+tcp://HOST:PORT?baud=921600            a serial server with raw TCP
   modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP; ?baud=38400 for a gateway
   modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port
-  can+socketcan://can0#NODE                     CAN on a network interface
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter
   can+socketcand://HOST:PORT/can0#NODE          CAN through a socketcand server
+  can+socketcan://can0#NODE                     CAN on a network interface
   can+python-can://INTERFACE/CHANNEL#NODE       CAN on any other interface of python-can
   sim://RIG.yaml                                a simulated amplifier of a rig
 Quote URLs that contain ?, # or &.
 """
 
+# end
+
 app = typer.Typer(no_args_is_help=True)
 amp = typer.Typer(
-    no_args_is_help=True, help="Control one amplifier by hand.", epilog=_URLS, rich_markup_mode=None
+    no_args_is_help=True,
+    help="Control one amplifier by hand.",
+    epilog=_URL_HELP,
+    rich_markup_mode=None,
 )
 app.add_typer(amp, name="amp")
 

@@ -18,8 +18,14 @@ from drivers.protocol.definition import (
     check_watchdog,
     loss_detection_time,
 )
-from drivers.urls import BUS_ERROR, CLOCK_ERRORS, line_kind_of
-from drivers.wires.wire import WireAddress, address_of, reply_words, request_words
+from drivers.urls import BUS_ERROR, CLOCK_ERRORS
+from drivers.wires.wire import (
+    WireAddress,
+    address_of,
+    line_kind_of,
+    reply_words,
+    request_words,
+)
 from registry.limits import GuardLimits
 
 _CEILING = QUANTITIES["frequency"].high

@@ -20,7 +20,7 @@ from drivers.protocol.definition import (
     Message,
 )
 from drivers.protocol.records import Values
-from drivers.urls import ADDRESS, AmplifierUrl
+from drivers.urls import ADDRESS, AmplifierUrl, with_fragment
 from drivers.wires.can_frames import (
     BITRATE,
     BLOCK,
@@ -61,6 +61,7 @@ _BUS = (
 _START: int = CANOPEN["nmt"]["start"]
 _BITRATES = 10_000, 1_000_000
 NODE_FORM = "node must be given as #{}"
+NODE_RANGE = "`#NODE` 1 to 127"  # in tables
 
 
 class _PendingRequest(NamedTuple):
@@ -229,6 +230,11 @@ class CanAddress(WireAddress):
         self._delay = delay
         self.number = url.whole(url.number, "node", NODE_MAX) if url.number else ADDRESS
         self.settings = {"protocol": "CAN", "bitrate": self.bitrate, **settings}
+
+    @staticmethod
+    def with_address(url: str, address: int) -> str:
+        """Return a URL with another node."""
+        return with_fragment(url, address)
 
     def make_wire(self) -> CanWire:
         """Make the wire with a random number, so that a reply to an earlier host does not match."""

@@ -17,15 +17,16 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import can
 
 from drivers.errors import LinkError, system_message
 from drivers.ports import FAILURES, DevicePort, Port
 from drivers.urls import AmplifierUrl
-from drivers.wires.can_bus import NODE_FORM, CanAddress
+from drivers.wires.can_bus import NODE_FORM, NODE_RANGE, CanAddress
 from drivers.wires.can_frames import ERROR_ID, REQUEST, CanFrame, pack_frames, unpack_frames
+from drivers.wires.wire import Scheme
 from registry.threads import in_thread
 
 
@@ -313,6 +314,31 @@ class PythonCanAddress(CanAddress):
 
     bus: arguments of `can.Bus`.
     """
+
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {
+        "can+socketcan": Scheme(
+            line_kind="can",
+            example="can+socketcan://can0#NODE",
+            help="CAN on a network interface",
+            number=NODE_RANGE,
+            forms={
+                "can+socketcan://INTERFACE#NODE": "`bitrate` 500000; must match the setting of "
+                "`ip link`"
+            },
+        ),
+        "can+python-can": Scheme(
+            line_kind="can",
+            example="can+python-can://INTERFACE/CHANNEL#NODE",
+            help="CAN on any other interface of python-can",
+            number=NODE_RANGE,
+            forms={
+                "can+python-can://INTERFACE/CHANNEL#NODE": "`bitrate` 500000; to select an "
+                "adapter: `device` (canalystii, neousys), `unique_hardware_id` (ixxat), `serial` "
+                "(neovi, vector), `device_id` (pcan), `device_number` (systec), `port` "
+                "(udp_multicast), `app_name` (vector)"
+            },
+        ),
+    }
 
     def __init__(self, url: str) -> None:
         interface = url.partition("://")[2].partition("/")[0]

@@ -8,14 +8,14 @@ import asyncio
 import contextlib
 import math
 import re
-from collections.abc import Callable
-from typing import final
+from collections.abc import Callable, Mapping
+from typing import ClassVar, final
 
 from drivers.errors import LinkError
 from drivers.ports import NETWORK_DELAY, Port, open_port
 from drivers.protocol.definition import BOOT_TIME
 from drivers.urls import AmplifierUrl
-from drivers.wires.can_bus import NODE_FORM, CanAddress
+from drivers.wires.can_bus import NODE_FORM, NODE_RANGE, CanAddress
 from drivers.wires.can_frames import (
     BLOCK,
     ERROR_ID,
@@ -28,7 +28,7 @@ from drivers.wires.can_frames import (
     pack_frames,
     unpack_frames,
 )
-from drivers.wires.wire import PortAbove
+from drivers.wires.wire import PortAbove, Scheme
 from registry import threads
 
 _SILENCE = 1.0  # s; twenty heartbeats of an amplifier
@@ -98,6 +98,19 @@ class TextPort(PortAbove):
 class SlcanAddress(CanAddress):
     """A node behind a serial adapter with LAWICEL's commands, on a port or behind a TCP port."""
 
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {
+        "can+slcan": Scheme(
+            line_kind="can-usb",
+            example="can+slcan:///dev/ttyACM0?bitrate=500000#NODE",
+            help="CAN on a serial adapter",
+            number=NODE_RANGE,
+            forms={
+                "can+slcan:///PATH#NODE": "`bitrate` 500000 (10, 20, 50, 100, 125, 250, 500, "
+                "800 kbit/s, 1 Mbit/s), `baud` 115200",
+                "can+slcan://HOST:PORT#NODE": "the same",
+            },
+        )
+    }
     boot_time = BOOT_TIME
 
     def __init__(self, url: str) -> None:
@@ -159,6 +172,18 @@ class _Opening:
 
 class SocketcandAddress(CanAddress):
     """A node on a bus that a socketcand server has."""
+
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {
+        "can+socketcand": Scheme(
+            line_kind="ethernet",
+            example="can+socketcand://HOST:PORT/can0#NODE",
+            help="CAN through a socketcand server",
+            number=NODE_RANGE,
+            forms={
+                "can+socketcand://HOST:PORT/BUS#NODE": "`bitrate` 500000; must match the server's"
+            },
+        )
+    }
 
     def __init__(self, url: str) -> None:
         parsed = AmplifierUrl(url, _SOCKETCAND_FORM, known=("bitrate",))

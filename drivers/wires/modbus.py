@@ -11,15 +11,15 @@ keeps an RTU line silent before each frame.
 import asyncio
 import contextlib
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import final
+from typing import ClassVar, final
 
 from drivers.errors import LinkError, WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
 from drivers.protocol.definition import BOOT_TIME, BROADCAST, REACTION, REQUESTS, Message
 from drivers.protocol.records import Refusal, Values
-from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
+from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl, with_fragment
 from drivers.wires.modbus_frames import (
     BOX,
     ECHO_SIZE,
@@ -52,6 +52,7 @@ from drivers.wires.wire import (
     DuplicateAddress,
     PortAbove,
     Reply,
+    Scheme,
     Wire,
     WireAddress,
     WrittenPart,
@@ -378,6 +379,31 @@ _PARITIES = {"even": "E", "odd": "O", "none": "N"}
 class ModbusAddress(WireAddress):
     """A unit over TCP, on a serial port of this machine, or behind a serial server."""
 
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {
+        "modbus+tcp": Scheme(
+            line_kind="ethernet",
+            example="modbus+tcp://HOST:PORT/UNIT",
+            help="Modbus over TCP; ?baud=38400 for a gateway",
+            number="`/UNIT` 1 to 247",
+            forms={
+                "modbus+tcp://HOST:PORT/UNIT": "`baud`: speed of the line behind a gateway (none). "
+                "Default port: 502"
+            },
+        ),
+        "modbus+rtu": Scheme(
+            line_kind="",
+            example="modbus+rtu:///dev/ttyS1?baud=115200#UNIT",
+            help="Modbus on a serial port",
+            number="`#UNIT` 1 to 247",
+            forms={
+                "modbus+rtu:///PATH#UNIT": "`baud` 115200, `parity` `even` (`odd`, `none`), "
+                "`stop` 1 (2)",
+                "modbus+rtu://HOST:PORT#UNIT": "`baud`: speed of the line behind the server "
+                "(unknown); `parity`, `stop`",
+            },
+        ),
+    }
+
     def __init__(self, url: str) -> None:
         self._is_rtu = url.lower().startswith("modbus+rtu")
         if self._is_rtu:
@@ -407,6 +433,16 @@ class ModbusAddress(WireAddress):
             "parity": self.place.parity,
             "stop": self.place.stop,
         }
+
+    @staticmethod
+    def with_address(url: str, address: int) -> str:
+        """Return a URL with another unit."""
+        if url.lower().startswith("modbus+rtu"):
+            return with_fragment(url, address)
+        location, _, options = url.partition("?")
+        host = "/".join(location.split("/")[:3])
+        query = f"?{options}" if options else ""
+        return f"{host}/{address}{query}"
 
     def make_wire(self) -> ModbusWire:
         """Make the wire with a random number, so that a reply to an earlier host does not match."""

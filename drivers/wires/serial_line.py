@@ -5,7 +5,9 @@ serial+tcp://HOST:PORT?baud=921600&address=1     a serial server with raw TCP
 """
 
 import random
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 from drivers.errors import WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
@@ -25,6 +27,7 @@ from drivers.wires.wire import (
     Arrival,
     BrokenReply,
     DuplicateAddress,
+    Scheme,
     Wire,
     WireAddress,
     read_event,
@@ -134,6 +137,24 @@ _FORM = (
 class SerialAddress(WireAddress):
     """An amplifier on a serial port of this machine, or behind a serial server."""
 
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {
+        "serial": Scheme(
+            line_kind="",
+            example="serial:///dev/ttyUSB0?baud=921600&address=1",
+            help="a serial port",
+            number="`?address=` 1 to 247",
+            forms={"serial:///PATH": "`baud` 921600"},
+        ),
+        "serial+tcp": Scheme(
+            line_kind="ethernet",
+            example="serial+tcp://HOST:PORT?baud=921600",
+            help="a serial server with raw TCP",
+            number="`?address=` 1 to 247",
+            forms={
+                "serial+tcp://HOST:PORT": "`baud`: speed of the line behind the server (unknown)"
+            },
+        ),
+    }
     boot_time = BOOT_TIME
 
     def __init__(self, url: str) -> None:
@@ -145,6 +166,13 @@ class SerialAddress(WireAddress):
         self.number = parsed.whole_option("address", ADDRESS, ADDRESS_MAX)
         self.line = self.place.name
         self.settings = {"protocol": "serial", "baud": self.place.baud}
+
+    @staticmethod
+    def with_address(url: str, address: int) -> str:
+        """Return a URL with another address."""
+        without_address = re.sub(r"(?<=[?&])address=\d+&?", "", url).rstrip("?&")
+        separator = "&" if "?" in without_address else "?"
+        return f"{without_address}{separator}address={address}"
 
     def make_wire(self) -> SerialWire:
         """Make the wire with a random number, so that a reply to an earlier host does not match."""

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 from drivers.errors import CommandError, LinkError, WireCounters
 from drivers.ports import Port
@@ -41,6 +41,7 @@ from drivers.protocol.records import (
     Text,
     Values,
 )
+from drivers.urls import UNKNOWN_KIND, Endpoint, kind_of_device, stated_kind
 from registry.plugins import PluginRegistry
 
 WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
@@ -227,9 +228,29 @@ class Wire(Protocol):
         return self.transit(words) + self.transit(reply)
 
 
+@dataclass(frozen=True, slots=True)
+class Scheme:
+    """A scheme of URLs: the facts that checks, the help and pages have of it."""
+
+    line_kind: str
+    """Kind of its lines, a key of `CLOCK_ERRORS`; empty if the name of the serial port decides."""
+    example: str
+    """A URL, for the help of `era amp`."""
+    help: str
+    """The line of the example."""
+    number: str
+    """Place and range of an amplifier's number, as the table of docs/reference/urls.md has them."""
+    forms: Mapping[str, str]
+    """Options with their defaults as that table has them, by scheme and place."""
+
+
 class WireAddress(ABC):
     """The place of an amplifier on one kind of wire, made from its URL; raises CommandError."""
 
+    SCHEMES: ClassVar[Mapping[str, Scheme]] = {}
+    """Schemes of its URLs, without those of plug-ins. `make pages` registers them."""
+    place: Endpoint = Endpoint()
+    """The serial device or network port of the line; empty for other lines."""
     line: str
     """Name of the port, connection or bus; amplifiers with the same name share it."""
     settings: Mapping[str, object]
@@ -242,6 +263,11 @@ class WireAddress(ABC):
     @abstractmethod
     def __init__(self, url: str) -> None:
         """Parse a URL."""
+
+    @staticmethod
+    def with_address(url: str, address: int) -> str:
+        """Return a URL with another address, unit or node; CommandError for a wire without any."""
+        raise CommandError(f"amplifiers at {url} have no address that can be set")
 
     @abstractmethod
     def make_wire(self) -> Wire:
@@ -291,23 +317,30 @@ class PortAbove:
         await self.below.wait_closed()
 
 
+# begin: written by docs/generators/urls_page.py classes
+
+_CLASSES: Mapping[str, str] = {
+    "can+python-can": "drivers.wires.can_interfaces:PythonCanAddress",
+    "can+slcan": "drivers.wires.can_text:SlcanAddress",
+    "can+socketcan": "drivers.wires.can_interfaces:PythonCanAddress",
+    "can+socketcand": "drivers.wires.can_text:SocketcandAddress",
+    "modbus+rtu": "drivers.wires.modbus:ModbusAddress",
+    "modbus+tcp": "drivers.wires.modbus:ModbusAddress",
+    "serial": "drivers.wires.serial_line:SerialAddress",
+    "serial+tcp": "drivers.wires.serial_line:SerialAddress",
+    # A plug-in of a package that imports this one; others never load it.
+    "sim": "sim.memory_line:SimulatedAddress",
+}
+"""The classes of the project's own schemes, loaded when they are used."""
+
+# end
+
 _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
     "wire",
     "era_haptics.wires",
     WireAddress,
     error=CommandError,
-    own={
-        "can+python-can": "drivers.wires.can_interfaces:PythonCanAddress",
-        "can+slcan": "drivers.wires.can_text:SlcanAddress",
-        "can+socketcan": "drivers.wires.can_interfaces:PythonCanAddress",
-        "can+socketcand": "drivers.wires.can_text:SocketcandAddress",
-        "modbus+rtu": "drivers.wires.modbus:ModbusAddress",
-        "modbus+tcp": "drivers.wires.modbus:ModbusAddress",
-        "serial": "drivers.wires.serial_line:SerialAddress",
-        "serial+tcp": "drivers.wires.serial_line:SerialAddress",
-        # A plug-in of the package `sim`, which imports this one; hosts of hardware never load it.
-        "sim": "sim.memory_line:SimulatedAddress",
-    },
+    own=_CLASSES,
     ending="://",
     example="serial:///dev/ttyUSB0?baud=921600",
 )
@@ -321,3 +354,23 @@ def schemes() -> tuple[str, ...]:
 def address_of(url: str) -> WireAddress:
     """Parse the URL of an amplifier; CommandError for an unknown or invalid one."""
     return _WIRES.make(url)
+
+
+def with_address(url: str, address: int) -> str:
+    """Return the URL with another address, unit or node; CommandError for a wire without any."""
+    return address_of(url).with_address(url, address)
+
+
+def line_kind_of(url: str) -> str:
+    """Return the kind of line of an amplifier's URL, as stated in it, or else the usual one.
+
+    Raises CommandError.
+    """
+    kind = stated_kind(url)
+    if kind:
+        return kind
+    address = address_of(url)
+    scheme = address.SCHEMES.get(url.partition("://")[0].lower())
+    if scheme is None:  # of a plug-in
+        return UNKNOWN_KIND
+    return scheme.line_kind or kind_of_device(address.place.device)

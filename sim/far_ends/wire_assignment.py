@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 
 from drivers.errors import CommandError
-from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD, Endpoint
+from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD
 from drivers.wires.can_frames import BITRATE
 from drivers.wires.wire import address_of
 from model.errors import InputError
@@ -136,12 +136,14 @@ def _on_modbus_rtu(speed: int | None, numbered: Numbered) -> AbstractContextMana
 class FarEndKind:
     """Opens the far end of a kind of wire; also the form of its URLs.
 
-    url: with {host} for a TCP port; speed: usual speed [bit/s]; line_kind: of its line with several
-    amplifiers; open_end: makes the far end of amplifiers by address, at a speed; bits: of a byte on
-    the line, with start, parity and stop, 0 if bytes take no time.
+    url: with {host} for a TCP port; opens: what the host opens, as a page has it; speed: usual
+    speed [bit/s]; line_kind: of its line with several amplifiers; open_end: makes the far end of
+    amplifiers by address, at a speed; bits: of a byte on the line, with start, parity and stop, 0
+    if bytes take no time.
     """
 
     url: str
+    opens: str
     speed: int
     line_kind: str
     open_end: Callable[[int | None, Numbered], AbstractContextManager[MakeEnd]]
@@ -172,6 +174,7 @@ class FarEndKind:
 FAR_ENDS: Mapping[str, FarEndKind] = {
     "serial": FarEndKind(
         "serial://{port}?baud={speed}&address={address}",
+        "a pseudo-terminal; `--shared` puts all amplifiers on one, at addresses 1, 2, ...",
         BAUD,
         "usb-high-speed",
         _on_serial_line,
@@ -179,12 +182,14 @@ FAR_ENDS: Mapping[str, FarEndKind] = {
     ),
     "modbus-tcp": FarEndKind(
         "modbus+tcp://{host}:{port}/{address}",
+        "a loopback port with a unit per amplifier; any free port if PORT is omitted",
         RTU_BAUD,
         "ethernet",
         _on_modbus_tcp,
     ),
     "modbus-rtu": FarEndKind(
         "modbus+rtu://{port}?baud={speed}#{address}",
+        "a pseudo-terminal with a unit per amplifier",
         RTU_BAUD,
         "usb-high-speed",
         _on_modbus_rtu,
@@ -192,12 +197,14 @@ FAR_ENDS: Mapping[str, FarEndKind] = {
     ),
     "socketcand": FarEndKind(
         f"can+socketcand://{{host}}:{{port}}/{BUS_NAME}?bitrate={{speed}}#{{address}}",
+        "a CAN bus behind a loopback port",
         BITRATE,
         "can",
         partial(_on_bus, SocketcandClient),
     ),
     "slcan": FarEndKind(
         "can+slcan://{port}?bitrate={speed}#{address}",
+        "a CAN bus behind a pseudo-terminal",
         BITRATE,
         "can-usb",
         partial(_on_bus, SlcanAdapter),
@@ -342,7 +349,7 @@ def _wire_of_url(name: str, url: str, defaults: SimulatedWire) -> SimulatedWire:
         address = address_of(url)
     except CommandError as problem:
         raise InputError(f"amplifier {name}: {problem}") from problem
-    endpoint = getattr(address, "place", Endpoint())
+    endpoint = address.place
     number = address.number
     if not FAR_ENDS[kind].is_ported:
         return replace(defaults, kind=kind, address=number, line=endpoint.name, shared=True)

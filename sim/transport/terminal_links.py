@@ -6,11 +6,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from drivers.wires.wire import address_of
 from model.errors import InputError
 from registry import files
-
-TERMINAL_SCHEMES = ("serial", "modbus+rtu", "can+slcan")
-"""Schemes of URLs that may name a pseudo-terminal."""
 
 
 def links_by_amplifier(options: Sequence[str], *, amplifiers: Sequence[str]) -> dict[str, Path]:
@@ -44,15 +42,15 @@ def linked_urls(urls: Mapping[str, str], links: Mapping[str, Path]) -> Iterator[
     with ExitStack() as stack:
         paths: dict[str, str] = {}
         for name, link in links.items():
-            parts = urlsplit(urls[name])
-            if parts.scheme not in TERMINAL_SCHEMES or parts.netloc:
+            terminal = urlsplit(urls[name]).path
+            if not address_of(urls[name]).place.device:
                 raise InputError(
                     f"--link {link}: amplifier {name} must be on a pseudo-terminal, got "
                     f"{urls[name]}"
                 )
-            if parts.path in paths:
+            if terminal in paths:
                 raise InputError(f"--link {link}: the line of {name} has one; give one per line")
-            paths[parts.path] = stack.enter_context(linked(link, to=parts.path))
+            paths[terminal] = stack.enter_context(linked(link, to=terminal))
         yield {name: _moved(url, paths) for name, url in urls.items()}
 
 

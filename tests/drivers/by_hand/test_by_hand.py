@@ -33,14 +33,12 @@ from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, READINGS, STATU
 from drivers.trace import tracing
 from drivers.urls import (
     CLOCK_ERRORS,
-    KIND_OF_SCHEME,
-    SCHEMES_OF_PORTS,
     SIMULATED,
     UNKNOWN_KIND,
-    line_kind_of,
-    with_address,
 )
-from drivers.wires.wire import schemes
+from drivers.wires import wire
+from drivers.wires.serial_line import SerialAddress
+from drivers.wires.wire import line_kind_of, with_address
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.conformance_report import ConformanceReport
 from kit.wires import WORD_WIRES, WordFarSide
@@ -641,13 +639,18 @@ def test_every_kind_of_line_that_is_simulated_has_an_error() -> None:
     assert CLOCK_ERRORS.keys() == {*LINE_KINDS, PROMPT}
 
 
-def test_every_scheme_of_the_project_has_a_kind_of_line() -> None:
-    """No scheme counts as unknown because it was forgotten; those of plug-ins do."""
-    own = {scheme for scheme in schemes() if not scheme.startswith("example")}
-    assert own == {*KIND_OF_SCHEME, *SCHEMES_OF_PORTS}
+def test_kind_of_line_is_stated_or_that_of_the_scheme_or_of_the_port(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A plug-in has no row in a table of schemes, and the kind of unknown lines."""
+    assert line_kind_of("serial:///dev/ttyACM0") == "usb-full-speed"
+    assert line_kind_of("can+slcan:///dev/ttyS0") == "can-usb"
     assert line_kind_of("MODBUS+TCP://host/1") == "ethernet"
-    assert line_kind_of("example-unix:///run/amplifier") == UNKNOWN_KIND
     assert line_kind_of("example-unix:///run/amplifier?line=native") == "native"
+    monkeypatch.setattr(wire, "address_of", SerialAddress)
+    assert line_kind_of("serial:///dev/ttyS0") == "native"
+    monkeypatch.setattr(SerialAddress, "SCHEMES", {})
+    assert line_kind_of("serial:///dev/ttyS0") == UNKNOWN_KIND
 
 
 def test_one_amplifier_with_eras_has_no_arrangement() -> None:

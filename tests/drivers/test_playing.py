@@ -34,7 +34,9 @@ from drivers.ports import Port, SerialPort, open_connection
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.urls import Endpoint
 from drivers.voices import Voice, along
-from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
+from era_haptics.lab.expectations.expected_outputs import ExpectedOutputs
+from era_haptics.lab.expectations.tolerances import Interval
+from era_haptics.lab.expectations.uncertain_playback import UncertainPlayback
 from kit.clock import in_virtual_time
 from kit.courses import Taken, courses, follow
 
@@ -306,19 +308,27 @@ class OfLayers(Taken):
 
     def may_commit(self, token: int, since: float, until: float, **layer: Any) -> None:
         """Let a layer play at some moment within."""
-        self.bounds.commit([layer_of(**layer)], token, (since, until))
+        self.bounds.commit([layer_of(**layer)], token, Interval(since, until))
 
     def expects(self, token: int, since: float, until: float, **layer: Any) -> None:
         """Let a layer be expected that began at some moment within."""
-        self.outputs.play([layer_of(**layer)], token, (since, until), is_exact=True)
+        self.outputs.play([layer_of(**layer)], token, Interval(since, until), is_exact=True)
+
+    def silences(self, since: float, until: float, ramp: float, cause: str) -> None:
+        """Let all layers be expected to fade from some moment within."""
+        self.outputs.silence(Interval(since, until), ramp, cause)
+
+    def sure_at(self, at: float) -> set[int]:
+        """Return the layers whose output is known at a moment."""
+        return self.outputs.sure(Interval(at, at))
 
     def shows(self, levels: Sequence[float], at: float) -> None:
         """Let the outputs show levels at a moment."""
-        self.outputs.check_levels(levels, (at, at), self.report)
+        self.outputs.check_levels(levels, Interval(at, at), self.report)
 
     def is_ambiguous(self, expected: bool, since: float, until: float, **layer: Any) -> None:
         """Require that it is unknown, or not, what a layer would play that comes within."""
-        assert self.bounds.is_ambiguous((since, until), [layer_of(**layer)]) is expected
+        assert self.bounds.is_ambiguous(Interval(since, until), [layer_of(**layer)]) is expected
 
 
 @asynccontextmanager
@@ -326,7 +336,7 @@ async def of_layers() -> AsyncIterator[OfLayers]:
     """Two channels, of eight voices each."""
     found: list[str] = []
     report = Mock(side_effect=lambda rule, *_, **__: found.append(rule))
-    how = {"unclear": None, "slack": 0.0, "cause": "", "began": (0.0, 0.0)}
+    how = {"unclear": None, "slack": 0.0, "cause": "", "began": Interval(0.0, 0.0)}
     yield OfLayers(
         playback=Playback(2, 8),
         bounds=UncertainPlayback(Playback(2, 8)),
@@ -438,13 +448,13 @@ def test_bounds_contain_every_amplifier(seed: int) -> None:
         ]
         one = random_layer(chance)
         layers, ramp = (None if chance.random() < 0.1 else [one]), chance.choice((0.0, 0.03))
-        if bounds.is_ambiguous((begin, end), layers, ramp):
+        if bounds.is_ambiguous(Interval(begin, end), layers, ramp):
             continue
         last_token += 1
         if layers is None:
-            bounds.silence((begin, end), ramp)
+            bounds.silence(Interval(begin, end), ramp)
         else:
-            bounds.commit(layers, last_token, (begin, end))
+            bounds.commit(layers, last_token, Interval(begin, end))
         for each, moment in zip(amplifiers, moments, strict=True):
             if layers is None:
                 each.silence(moment, ramp)

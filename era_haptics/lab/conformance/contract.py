@@ -23,7 +23,7 @@ from era_haptics.lab.conformance.checks import (
     watchdog_checks,
 )
 
-CHECKS: tuple[ConformanceCheck, ...] = (
+_READING = (
     identity_checks.identity,
     identity_checks.capabilities,
     identity_checks.starts_disarmed,
@@ -37,6 +37,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     modbus_checks.pieces,
     can_checks.objects,
     request_checks.lengths,
+)
+_STATES = (
     state_checks.stop,
     state_checks.stop_ramps,
     state_checks.silence_never_later,
@@ -51,6 +53,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     state_checks.sessions,
     state_checks.arming_ends_fades,
     request_checks.obeys_in_time,
+)
+_WATCHDOG = (
     watchdog_checks.watchdog,
     watchdog_checks.watchdog_unread,
     watchdog_checks.what_feeds,
@@ -58,6 +62,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     watchdog_checks.trips_amid_other_requests,
     watchdog_checks.trips_amid_fades,
     watchdog_checks.fault_list,
+)
+_SETS = (
     set_checks.every_channel,
     set_checks.levels_of_every_frequency,
     set_checks.achieved,
@@ -71,6 +77,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     part_checks.empty_sets,
     part_checks.max_set,
     part_checks.sets_expire,
+)
+_STARTS = (
     start_checks.stage_and_commit,
     start_checks.repeats_change_nothing,
     start_checks.tokens_wrap,
@@ -81,6 +89,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     clock_checks.clock_readings,
     clock_checks.clock_shifts,
     clock_checks.clock_rate,
+)
+_LAYERS = (
     layer_checks.layers_add,
     layer_checks.layers_play_on,
     layer_checks.valid_for,
@@ -88,6 +98,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     layer_checks.after,
     layer_checks.after_the_last_onset,
     layer_checks.what_waits_for_an_onset,
+)
+_TRANSITIONS = (
     transition_checks.ramps,
     transition_checks.cross_fades,
     transition_checks.kept_phase,
@@ -98,6 +110,8 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     sum_checks.phases,
     sum_checks.voices,
     sum_checks.limited,
+)
+_FRAMES = (
     frame_checks.damaged_frames,
     frame_checks.doubled_frames,
     serial_checks.tolerated_frames,
@@ -108,11 +122,24 @@ CHECKS: tuple[ConformanceCheck, ...] = (
     can_checks.network_management,
     can_checks.heartbeats,
     can_checks.emergencies,
+)
+_LINES = (
     line_checks.events,
     line_checks.broadcasts,
     clock_checks.mark,
     line_checks.addresses,
     identity_checks.measured,
+)
+CHECKS: tuple[ConformanceCheck, ...] = (
+    *_READING,
+    *_STATES,
+    *_WATCHDOG,
+    *_SETS,
+    *_STARTS,
+    *_LAYERS,
+    *_TRANSITIONS,
+    *_FRAMES,
+    *_LINES,
 )
 """All checks; their numbers begin at 1."""
 

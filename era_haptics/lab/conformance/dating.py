@@ -5,22 +5,13 @@ machine's by u - r to u - s. The intersection of these intervals over all readin
 late this machine was.
 """
 
-from typing import NamedTuple
-
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, QUANTITIES, SPAN, ahead
 from era_haptics.lab.conformance.outcomes import ContractViolation
-from era_haptics.lab.expected_output import DRIFT
+from era_haptics.lab.expectations.tolerances import DRIFT, Interval
 
 _MAX_GAP = 5.0  # s without a reading, after which the clock can have wrapped
 _LEVEL_AGE = 0.0002  # s; levels in a status can be older than its clock by this
 _CLOCK_ERROR = QUANTITIES["clock_error"]
-
-
-class When(NamedTuple):
-    """Interval in which something happened [s]."""
-
-    earliest: float
-    latest: float
 
 
 class Dating:
@@ -50,13 +41,13 @@ class Dating:
             quantity = "contradiction between readings of its clock"
             raise violation(quantity, expected="0 ms", actual=f"{1e3 * self.error:.3g} ms")
 
-    def between(self, earliest: float, latest: float) -> When:
+    def between(self, earliest: float, latest: float) -> Interval:
         """Return an interval; raises ContractViolation for an empty one."""
         if earliest > latest:
             self.expect_steady()
-        return When(min(earliest, latest), latest)
+        return Interval(min(earliest, latest), latest)
 
-    def interval(self, when: When) -> When:
+    def interval(self, when: Interval) -> Interval:
         """Convert an interval of this machine after the last reading."""
         if self._clock is None:
             return when
@@ -64,7 +55,7 @@ class Dating:
         earliest = max(when.earliest + self._min_lead - drift, self._time)
         return self.between(earliest, when.latest + self._max_lead + drift)
 
-    def dated(self, clock: int, when: When, clock_error: int) -> When:
+    def dated(self, clock: int, when: Interval, clock_error: int) -> Interval:
         """Return when a status with this clock, read in an interval of this machine, was true.
 
         clock_error: the amplifier's capability.
@@ -79,9 +70,9 @@ class Dating:
             self._max_lead = self._time - when.earliest
             return when
         self._advance(ahead(clock, last_clock) / self.pace, when, clock_error)
-        return When(self._time - _LEVEL_AGE, self._time)
+        return Interval(self._time - _LEVEL_AGE, self._time)
 
-    def _advance(self, duration: float, when: When, clock_error: int) -> None:
+    def _advance(self, duration: float, when: Interval, clock_error: int) -> None:
         """Narrow the bounds of the lead by a reading that is `duration` [s] after the last one."""
         self._time += duration
         slack = _CLOCK_ERROR.from_wire(clock_error)

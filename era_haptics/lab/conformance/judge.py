@@ -6,8 +6,8 @@ from functools import partial
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem
 from era_haptics.lab.conformance.outcomes import ContractViolation, require_in_time
-from era_haptics.lab.expected_amplifier import ExpectedAmplifier
-from era_haptics.lab.expected_output import Interval
+from era_haptics.lab.expectations.expected_amplifier import ExpectedAmplifier
+from era_haptics.lab.expectations.tolerances import Interval
 
 
 class Judge(ExpectedAmplifier):
@@ -22,8 +22,10 @@ class Judge(ExpectedAmplifier):
         self.identified(can)
         self.check(rest, when)
 
-    def _violated(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
-        raise ContractViolation(what, expected=must, actual=seen)
+    def _violated(
+        self, rule: str, time: float, quantity: str, *, expected: object, actual: object
+    ) -> None:
+        raise ContractViolation(quantity, expected=expected, actual=actual)
 
     def achieved(self, layer_set: LayerSet, reply: Values) -> LayerSet:
         """Return a layer as achieved according to the reply to GetAchieved.
@@ -36,5 +38,5 @@ class Judge(ExpectedAmplifier):
         if problem:
             rule, quantity, expected, actual = problem
             quantity = f"{quantity} in layer {layer_set.layer}"
-            self.report(rule, 0.0, quantity, must=expected, seen=actual)
+            self.report(rule, 0.0, quantity, expected=expected, actual=actual)
         return achieved_layer(layer_set, reply, self.can)

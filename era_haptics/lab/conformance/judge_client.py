@@ -15,9 +15,9 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import NAK, NAK_RECORD, REACTION, REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.wires.wire import read_nak
-from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.lateness import Lateness
 from era_haptics.lab.conformance.outcomes import NoReply, expect_equal, read_as, verify
+from era_haptics.lab.expectations.tolerances import Interval
 from registry import threads
 
 JUDGE_REPLY_TIMEOUT = 0.5
@@ -58,7 +58,7 @@ class RequestOutcome:
     code: str
     channel: int | None
     words: tuple[int, ...]
-    when: When
+    when: Interval
     values: Values = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Any:
@@ -173,7 +173,7 @@ class JudgeClient(ABC):
         message = await self.replied(
             lambda message: message.number == sequence, message_name(number)
         )
-        when = When(sent_at, message.at)
+        when = Interval(sent_at, message.at)
         if message.type == NAK:
             outcome = self.rejection(when, number, message.words)
         else:
@@ -189,7 +189,7 @@ class JudgeClient(ABC):
         """Send a message without a reply: a part of a set other than the last."""
         self.write(self.request(number, words))
 
-    def rejection(self, when: When, number: int, words: Sequence[int]) -> RequestOutcome:
+    def rejection(self, when: Interval, number: int, words: Sequence[int]) -> RequestOutcome:
         """Convert a Nak to an outcome; raises ContractViolation if it names another request."""
         nak = read_as("Nak", read_nak, words, is_strict=True)
         expect_equal(words[NAK_RECORD.places["request"]], number, "request that a Nak names")

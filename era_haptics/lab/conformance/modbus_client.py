@@ -27,7 +27,6 @@ from drivers.wires.modbus_frames import (
     unpack_identity,
     write_pdu,
 )
-from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.judge_client import (
     GATEWAY_TIMEOUT,
     QUIET_TIME,
@@ -38,6 +37,7 @@ from era_haptics.lab.conformance.judge_client import (
     with_flipped_bit,
 )
 from era_haptics.lab.conformance.outcomes import expect_equal, read_as, verify
+from era_haptics.lab.expectations.tolerances import Interval
 from registry import threads
 
 _PRESENT_NUMBERS = tuple(MESSAGES[name].number for name in PRESENT)
@@ -85,7 +85,7 @@ class ModbusClient(JudgeClient):
         transaction = 0 if self.is_rtu else self.number
         return framed(unit, pdu, transaction, is_rtu=self.is_rtu)
 
-    async def transact(self, pdu: bytes) -> tuple[bytes, When]:
+    async def transact(self, pdu: bytes) -> tuple[bytes, Interval]:
         """Send a PDU and await its response; return that and when it was carried out."""
         data = self.adu(pdu)
         sent_at = threads.now()
@@ -108,7 +108,7 @@ class ModbusClient(JudgeClient):
             expected = "its registers, or address and count"
             quantity = f"response to {pdu[:5].hex(' ')}"
             verify(fits, quantity, expected=expected, actual=hexadecimal)
-        return response, When(sent_at, message.at)
+        return response, Interval(sent_at, message.at)
 
     async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
         """Read registers; ContractViolation for an exception."""
@@ -135,7 +135,7 @@ class ModbusClient(JudgeClient):
         return await self._read_reply(number, tag, when)
 
     async def _read_reply(
-        self, number: int, tag: int | None = None, when: When | None = None
+        self, number: int, tag: int | None = None, when: Interval | None = None
     ) -> RequestOutcome:
         """Read the reply area of a message; tag, when: of the write before it, if there is one."""
         sent_at = threads.now()
@@ -143,7 +143,7 @@ class ModbusClient(JudgeClient):
         area = await self.read(BOX * number + REPLY_OFFSET, HEAD + word_count)
         area_tag, result, *words = area
         if when is None:
-            when = When(sent_at, threads.now())
+            when = Interval(sent_at, threads.now())
         if tag is not None:
             expect_equal(area_tag, tag, f"tag of the reply to {message_name(number)}")
         if result:

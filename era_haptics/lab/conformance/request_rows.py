@@ -1,4 +1,4 @@
-"""Requests of a check as rows: which are sent, and which outcomes are allowed."""
+"""Rows of a check: requests with their allowed outcomes, layers to play, and pauses."""
 
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class Send:
     """Request from values (with the held session unless another is given) or from raw words.
 
     layers: of a set, which is sent in parts. codes: allowed outcomes, "" meaning carried out.
-    channels: those that a rejection can name.
+    channels: channels that a rejection can name, None for no channel.
     """
 
     name: str
@@ -51,8 +51,13 @@ def send(
     return Send(name, raw, values, layers, codes, channels)
 
 
+STOP_NOW = send("Stop", ramp=0)
+DISARM_NOW = send("Disarm", ramp=0)
+SILENCE_NOW = send("Silence", ramp=0)
+
+
 def play_now(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
-    """Build a set that plays immediately; values: token, session, code, as in `send`."""
+    """Build a set that plays immediately; values: token, session and code for `send`."""
     return send("Set", layers=layers, now=now, **values)
 
 

@@ -22,7 +22,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_last, pack_layers, parts
 from drivers.wires.wire import reply_words
 from era_haptics.lab.conformance.capabilities import STATED, Capabilities
-from era_haptics.lab.conformance.dating import Dating, When
+from era_haptics.lab.conformance.dating import Dating
 from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.judge_client import (
     JUDGE_REPLY_TIMEOUT,
@@ -50,8 +50,8 @@ from era_haptics.lab.conformance.request_rows import (
     stage,
 )
 from era_haptics.lab.conformance.stimuli import READ_REQUESTS, Stimuli
-from era_haptics.lab.expected_amplifier import OFF, request_text
-from era_haptics.lab.expected_output import SAMPLE
+from era_haptics.lab.expectations.expected_amplifier import OFF, request_text
+from era_haptics.lab.expectations.tolerances import SAMPLE, Interval
 from registry import threads
 
 _SAMPLES = 12  # statuses per transition
@@ -218,7 +218,7 @@ class Subject(Stimuli):
         if not _has_reply(name, raw, values):
             self._pending_parts.append(SentPart(sent_at, values, len(words)))
             await self.client.part(number, words)
-            return RequestOutcome("", None, (), When(sent_at, threads.now()))
+            return RequestOutcome("", None, (), Interval(sent_at, threads.now()))
         reply = await self.client.exchange(number, words)
         self._check_fed()  # it can have been carried out after the watchdog tripped
         duration = threads.now() - sent_at
@@ -251,7 +251,7 @@ class Subject(Stimuli):
             expect_equal(len(self.client.inbox), 0, "number of replies to parts before the last")
         if self._judge is not None:
             for part in pending:
-                when = self.dating.interval(When(part.sent_at, latest))
+                when = self.dating.interval(Interval(part.sent_at, latest))
                 self._judge.part_came(part.values, when)
         if self.client.transactions > 1:  # each had its response
             return 0.0
@@ -293,7 +293,7 @@ class Subject(Stimuli):
             judge.granted(name, values, shown, reply.when)
             if is_dated:  # sets that start with the next sample can show already
                 latest = reply.when.latest
-                judge.clock.check(shown["clock"], (latest - SAMPLE, latest))
+                judge.clock.check(shown["clock"], Interval(latest - SAMPLE, latest))
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
         return replace(reply, values=shown)
 
@@ -316,7 +316,7 @@ class Subject(Stimuli):
         is_marked = self._judge is not None and self._judge.clock.is_marked
         return "clock" in reply and name != "Mark" and not is_marked
 
-    def _dated(self, name: str, values: Values, reply: Values, when: When) -> When:
+    def _dated(self, name: str, values: Values, reply: Values, when: Interval) -> Interval:
         """Return the interval, on the amplifier's clock, in which a status was true and its request
         carried out.
 
@@ -403,7 +403,7 @@ class Subject(Stimuli):
         judge = self._judge
         if self.is_starving or judge is None or judge.state != ENABLED:
             return 0.0
-        return (threads.now() - judge.fed[0]) / judge.watchdog
+        return (threads.now() - judge.fed.earliest) / judge.watchdog
 
     @property
     def is_hungry(self) -> bool:
@@ -414,7 +414,7 @@ class Subject(Stimuli):
         """Feed the watchdog if due, so that it was fed a while ago and is not due soon."""
         if self._since_fed > _MAX_UNFED:
             await self.ping()
-        await asyncio.sleep(max(self.judge.fed[1] + _UNFED - threads.now(), 0.0))
+        await asyncio.sleep(max(self.judge.fed.latest + _UNFED - threads.now(), 0.0))
 
     async def starve(self) -> None:
         """Stop feeding: from now on the watchdog may expire."""
@@ -469,9 +469,9 @@ class Subject(Stimuli):
         self.sent_set = [words]
         return part, words
 
-    def since(self, sent_at: float) -> When:
+    def since(self, sent_at: float) -> Interval:
         """Return the interval from a time of this machine until now, by the amplifier's clock."""
-        return self.dating.interval(When(sent_at, threads.now()))
+        return self.dating.interval(Interval(sent_at, threads.now()))
 
     def played(self, part: Values, sent_at: float) -> None:
         """Record that a single-part set, sent at a given time, was carried out."""
@@ -555,9 +555,9 @@ class Subject(Stimuli):
         """
         began = self.judge.outputs.began
         if duration is None:
-            end = self.judge.outputs.settled_at(began[1]) + _SETTLING
+            end = self.judge.outputs.settled_at(began.latest) + _SETTLING
         else:
-            end = began[0] + duration
+            end = began.earliest + duration
         two_exchanges = min(2 * self.exchange_time, 2.0)  # of a slow line
         end = max(end, threads.now() + min(two_exchanges, 2 * self.read_time))
         time = end - self.heard_at
@@ -566,7 +566,7 @@ class Subject(Stimuli):
         count = 0
         while threads.now() < end + (extension if count < 2 else 0):
             reply = await self.status()
-            width = reply.when.latest - reply.when.earliest + began[1] - began[0]
+            width = reply.when.latest - reply.when.earliest + began.latest - began.earliest
             max_width = _NARROW + 2 * max(self.exchange_time, self.client.transit)
             if width <= max_width:
                 count += 1

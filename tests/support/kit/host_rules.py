@@ -60,7 +60,7 @@ from drivers.wires.wire import (
     WireAddress,
     address_of,
 )
-from era_haptics.lab.expected_output import silent
+from era_haptics.lab.expectations.expected_outputs import silent
 from registry import threads
 from sim.faults import FaultWindow
 

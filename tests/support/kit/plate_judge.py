@@ -1,7 +1,7 @@
 """Judges what simulated amplifiers really do: their replies, and what they play on the plate.
 
 The amplifiers are followed at their end of the wire by the model that conformance has of one
-(`era_haptics.lab.expected_amplifier`): state, latch, watchdog, tokens, levels and clock of each
+(`era_haptics.lab.expectations`): state, latch, watchdog, tokens, levels and clock of each
 reply must be as expected. Fingers are judged by the touch frames alone and docs/reference/touch.md.
 What must hold whatever fails is judged by what really plays, with bounds that the fault table and
 the timeouts of a link add up to. Times in s.
@@ -16,7 +16,8 @@ from controller.sources.touch import TouchFrame
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last
-from era_haptics.lab.expected_amplifier import ExpectedAmplifier
+from era_haptics.lab.expectations.expected_amplifier import ExpectedAmplifier
+from era_haptics.lab.expectations.tolerances import Interval
 from kit.host_rules import HostRules, RuleViolation, tell_first
 from kit.wires import FarSide, after_each
 from registry.virtual_time import START
@@ -44,7 +45,7 @@ class AmplifierRules(ExpectedAmplifier):
 
     def check_frequencies(self, played: Mapping[int, float], now: float) -> None:
         """Compare the frequencies [Hz] of channels that play steadily with the commanded ones."""
-        when = now, now
+        when = Interval(now, now)
         self.advance(now)
         if self.may_start(when) or len(self.outputs.sure(when)) < _LAYERS:
             return
@@ -56,7 +57,7 @@ class AmplifierRules(ExpectedAmplifier):
             is_other = all(abs(each - frequency) > _HALF_STEP for each in commanded)
             if commanded and is_settled and is_other:
                 what = f"frequency of channel {channel}"
-                self.report("plays", now, what, must=commanded, seen=frequency)
+                self.report("plays", now, what, expected=commanded, actual=frequency)
 
     def _handle(self, name: str, values: Values, now: float) -> Values:
         """Have a request carried out, and compare the reply."""
@@ -69,7 +70,7 @@ class AmplifierRules(ExpectedAmplifier):
         except Refusal as refusal:
             self._refused(name, values, refusal, now)
             raise
-        when = now, now
+        when = Interval(now, now)
         if is_part:
             self.part_came(values, when)
         else:
@@ -82,14 +83,14 @@ class AmplifierRules(ExpectedAmplifier):
         if name == "Set":
             self.part_refused(values, refusal.code)
         if name in ("Stop", "Disarm") and refusal.code != "BUSY":
-            self.report("stop", now, f"answer to {name}", must="a status", seen=refusal.code)
+            self.report("stop", now, f"answer to {name}", expected="a status", actual=refusal.code)
 
     def _event_sent(self, event: Values, at: float) -> None:
         """Compare an Event, unless a request has caused it, whose reply shows the same."""
         if at >= self._obeys_at > at - _SLACK:
             return
         self.advance(at)
-        when = at, at
+        when = Interval(at, at)
         if not self.note_state(event, when):
             self._adopt(event, when)
         self.last_status = at
@@ -101,8 +102,10 @@ class AmplifierRules(ExpectedAmplifier):
             # The temperature jumps: the amplifier derates before any status shows it.
             self.outputs.may_derate = True
 
-    def _note(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
-        what = f"amplifier {self._name}: {what} must be {must}, got {seen}"
+    def _note(
+        self, rule: str, time: float, quantity: str, *, expected: object, actual: object
+    ) -> None:
+        what = f"amplifier {self._name}: {quantity} must be {expected}, got {actual}"
         self._violations.append(RuleViolation(rule, time, what))
 
 

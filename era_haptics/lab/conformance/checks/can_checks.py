@@ -35,7 +35,7 @@ from era_haptics.lab.conformance.outcomes import (
 )
 from era_haptics.lab.conformance.request_rows import layer
 from era_haptics.lab.conformance.subject import Subject
-from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
+from era_haptics.lab.expectations.expected_amplifier import FAULT, OFF, REACTING
 from registry import threads
 
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127

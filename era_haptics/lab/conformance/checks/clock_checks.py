@@ -12,7 +12,6 @@ from drivers.protocol.definition import (
     REACTION,
 )
 from era_haptics.lab.conformance.check import driving, reading
-from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.outcomes import (
     ContractViolation,
     UntimedClock,
@@ -20,9 +19,15 @@ from era_haptics.lab.conformance.outcomes import (
     require,
     verify,
 )
-from era_haptics.lab.conformance.request_rows import RequestRows, send
+from era_haptics.lab.conformance.request_rows import (
+    DISARM_NOW,
+    SILENCE_NOW,
+    STOP_NOW,
+    RequestRows,
+    send,
+)
 from era_haptics.lab.conformance.subject import RATE_STEP, Subject
-from era_haptics.lab.expected_output import DRIFT
+from era_haptics.lab.expectations.tolerances import DRIFT, Interval
 from registry import threads
 
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
@@ -96,7 +101,7 @@ async def _expect_shift(subject: Subject, steps: int) -> None:
     """Arm with a shift, then again with the session held."""
     await subject.arm(shift=steps)
     same_session = send("Arm", watchdog=subject.can["watchdog_max"], shift=_SHIFTS[1])
-    await subject.run([same_session, send("Disarm", ramp=0), subject.settle])
+    await subject.run([same_session, DISARM_NOW, subject.settle])
     await subject.request("GetStatus")
     subject.dating.expect_steady()
 
@@ -119,12 +124,12 @@ async def clock_rate(subject: Subject) -> None:
     read = partial(_expect_rate, subject, duration)
     keeps_rate: RequestRows = [
         send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"),
-        send("Silence", ramp=0),
+        SILENCE_NOW,
         send("Arm", watchdog=subject.can["watchdog_max"], shift=1),
         timed,
         partial(_expect_rate, subject, layer_time + duration),
     ]
-    stops: RequestRows = [fast, send("Stop", ramp=0), slow, read, subject.clear]
+    stops: RequestRows = [fast, STOP_NOW, slow, read, subject.clear]
     disarm = send("Disarm", ramp=subject.ramp)
     disarms: RequestRows = [fast, disarm, slow, subject.settle, slow, read]
     watchdog_time = subject.shortest_watchdog / 1000
@@ -165,7 +170,7 @@ async def mark(subject: Subject) -> None:
         written_at = threads.now()
         await asyncio.sleep(_MARKED)
         received_by = written_at + REACTION + client.transit
-        when = subject.dating.interval(When(sent_at, received_by))
+        when = subject.dating.interval(Interval(sent_at, received_by))
         subject.judge.carry_out("Mark", {}, {}, when)
         await subject.run([subject.ping, subject.status])
         expect_equal(len(client.inbox), 0, "number of replies to a broadcast Mark")

@@ -7,7 +7,15 @@ from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import require_in_time
-from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send, stage
+from era_haptics.lab.conformance.request_rows import (
+    SILENCE_NOW,
+    RequestRows,
+    Row,
+    layer,
+    play_now,
+    send,
+    stage,
+)
 from era_haptics.lab.conformance.subject import Subject
 
 _BIT_15 = 1 << 15  # ms
@@ -114,7 +122,7 @@ def after(subject: Subject) -> RequestRows:
         (subject.layer_0(), waiting),
         (rising, waiting, layer(0), onset_end),
         (rising, waiting, subject.layer_0(level=0.75), onset_end),
-        (rising, waiting, send("Silence", ramp=0), onset_end),
+        (rising, waiting, SILENCE_NOW, onset_end),
         # Only one layer of a set waits.
         (rising, stage(waiting, other_layer), send("Commit", token=2)),
         (rising, stage(other_layer, waiting), send("Commit", token=2)),

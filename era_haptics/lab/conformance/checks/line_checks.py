@@ -25,7 +25,7 @@ from era_haptics.lab.conformance.outcomes import (
     require_in_time,
     verify,
 )
-from era_haptics.lab.conformance.request_rows import send, stage
+from era_haptics.lab.conformance.request_rows import DISARM_NOW, STOP_NOW, send, stage
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
@@ -67,8 +67,8 @@ async def events(subject: Subject) -> None:
             subject.layer_0(),
             send("Disarm", ramp=50),
             subject.settle,
-            send("Stop", ramp=0),
-            send("Stop", ramp=0),
+            STOP_NOW,
+            STOP_NOW,
             subject.clear,
             0.02,
         ]
@@ -243,7 +243,7 @@ async def _expect_not_moved(subject: Subject, move: Values) -> None:
     for address in (0, subject.client.addresses + 1):
         await subject.run([send("SetAddress", raw=[address, *text], code="BAD_VALUE")])
     while_armed = send("SetAddress", **move, code="WRONG_STATE")
-    await subject.run([subject.arm, while_armed, send("Disarm", ramp=0), subject.settle])
+    await subject.run([subject.arm, while_armed, DISARM_NOW, subject.settle])
 
 
 async def _expect_moved(client: JudgeClient, old_address: int) -> None:

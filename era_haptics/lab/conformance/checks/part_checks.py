@@ -11,6 +11,7 @@ from drivers.protocol.sets import LayerSet, pack_layers
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import require
 from era_haptics.lab.conformance.request_rows import (
+    DISARM_NOW,
     RequestRows,
     Row,
     Send,
@@ -167,7 +168,7 @@ def parts_that_are_dropped(subject: Subject) -> RequestRows:
         last,
         drop_all,
         send("Commit", token=9),
-        send("Disarm", ramp=0),
+        DISARM_NOW,
         subject.settle,
         first,
         _with(last, code="WRONG_STATE"),

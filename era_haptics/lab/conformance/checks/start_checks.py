@@ -20,7 +20,10 @@ from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import RequestOutcome
 from era_haptics.lab.conformance.outcomes import expect_within
 from era_haptics.lab.conformance.request_rows import (
+    DISARM_NOW,
     FULL,
+    SILENCE_NOW,
+    STOP_NOW,
     RequestRows,
     Row,
     layer,
@@ -29,7 +32,7 @@ from era_haptics.lab.conformance.request_rows import (
     stage,
 )
 from era_haptics.lab.conformance.subject import Subject
-from era_haptics.lab.expected_output import CLOCK_DRIFT
+from era_haptics.lab.expectations.tolerances import CLOCK_DRIFT
 from registry import threads
 
 _AROUND = 0.015  # s; from a moment, in which statuses are dense
@@ -122,10 +125,10 @@ def newer_sets_replace(subject: Subject) -> RequestRows:
         half,
         dropped(token=3),
         stage(subject.layer_0()),
-        send("Silence", ramp=0),
+        SILENCE_NOW,
         dropped(token=5),
         stage(subject.layer_0()),
-        send("Disarm", ramp=0),
+        DISARM_NOW,
         subject.settle,
         subject.arm,
         dropped(token=6),
@@ -235,9 +238,9 @@ def _rows_before_the_moment(subject: Subject, lead: float) -> list[list[Row]]:
     part, *_ = subject.parts(half, token=2, now=0, count=3)
     rejected_set = play_now(layer(0, after=True), token=3, code="BAD_VALUE")
     return [
-        [send("Silence", ramp=0)],
-        [send("Stop", ramp=0)],
-        [send("Disarm", ramp=0), subject.settle, subject.arm],
+        [SILENCE_NOW],
+        [STOP_NOW],
+        [DISARM_NOW, subject.settle, subject.arm],
         [send("Arm", watchdog=subject.can["watchdog_max"])],
         [play_now(half)],
         [play_now(same_layer)],

@@ -5,7 +5,17 @@ from functools import partial
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import token_after
 from era_haptics.lab.conformance.check import driving
-from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send, stage
+from era_haptics.lab.conformance.request_rows import (
+    DISARM_NOW,
+    SILENCE_NOW,
+    STOP_NOW,
+    RequestRows,
+    Row,
+    layer,
+    play_now,
+    send,
+    stage,
+)
 from era_haptics.lab.conformance.subject import Subject
 
 _WATCHDOG, _MAX_RAMP = QUANTITIES["watchdog"], QUANTITIES["ramp"].maximum
@@ -57,7 +67,7 @@ def arming(subject: Subject) -> RequestRows:
         subject.arm,
         play_now(subject.layer_0(), token=40_000),
         stage(subject.layer_0(), token=40_001),
-        send("Disarm", ramp=0),
+        DISARM_NOW,
         subject.settle,
         subject.arm,
         send("Commit", token=40_001, code="BAD_TOKEN"),
@@ -101,13 +111,13 @@ def sessions(subject: Subject) -> RequestRows:
         stage(subject.layer_0()),
         *(partial(_expect_wrong_session, subject, session) for session in other_sessions),
         send("Ping", session=0, code="BAD_VALUE"),
-        send("Disarm", ramp=0),
+        DISARM_NOW,
         subject.settle,
         play_now(quiet, session=0x1235, code="WRONG_STATE"),
         send("Arm", watchdog=watchdog_max, session=_SESSION, code="WRONG_SESSION"),
         partial(_arm_as, subject, _SESSION ^ 0x100),
         play_now(quiet, session=_SESSION, code="WRONG_SESSION"),
-        send("Stop", ramp=0),
+        STOP_NOW,
         subject.settle,
         subject.clear,
         send("Arm", watchdog=watchdog_max, code="WRONG_SESSION"),
@@ -166,7 +176,7 @@ def stop(subject: Subject) -> RequestRows:
         subject.arm,
         subject.all_channels(),
         stage(subject.layer_0(level=0.5)),
-        send("Stop", ramp=0),
+        STOP_NOW,
         0.02,
         *rows_while_latched(subject),
         send("Commit", token=2, code="WRONG_STATE"),
@@ -240,9 +250,9 @@ def stops_are_numbered(subject: Subject) -> RequestRows:
     latch = token_after(token_after(token_after(subject.latch)))
     other_latches = (latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100
     return [
-        send("Stop", ramp=0),
-        send("Stop", ramp=0),
-        send("Stop", ramp=0),
+        STOP_NOW,
+        STOP_NOW,
+        STOP_NOW,
         *(send("Clear", latch=number, code="WRONG_LATCH") for number in other_latches),
         subject.clear,
         subject.clear,
@@ -298,7 +308,7 @@ def silence(subject: Subject) -> RequestRows:
         send("Commit", token=2, code="BAD_TOKEN"),
         subject.layer_0(),
         send("Set", **first_part),
-        send("Silence", ramp=0),
+        SILENCE_NOW,
         send("Set", **last_part),
         send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
     ]

@@ -8,7 +8,13 @@ from drivers.protocol.definition import HIGH_TIME, HIGH_WORDS, has_flag
 from drivers.protocol.sets import Command, Envelope
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import expect_equal, require
-from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send
+from era_haptics.lab.conformance.request_rows import (
+    SILENCE_NOW,
+    RequestRows,
+    Row,
+    layer,
+    play_now,
+)
 from era_haptics.lab.conformance.subject import Subject
 
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
@@ -75,7 +81,7 @@ def voices(subject: Subject) -> RequestRows:
     """
     plan = VoicePlan(subject)
     follow = partial(subject.follow, 0.015)
-    silence = send("Silence", ramp=0)
+    silence = SILENCE_NOW
     cuts: list[Row] = []
     for number in range(plan.fades, plan.fades + len(_SHARES)):
         cuts += [partial(plan.play_at_moment, number), follow]

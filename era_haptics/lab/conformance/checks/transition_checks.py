@@ -6,7 +6,7 @@ from functools import partial
 
 from drivers.protocol.sets import Envelope
 from era_haptics.lab.conformance.check import driving
-from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, send
+from era_haptics.lab.conformance.request_rows import SILENCE_NOW, RequestRows, Row, layer, send
 from era_haptics.lab.conformance.subject import Subject
 
 _STEPS_PER_MS = 10  # of an envelope's step
@@ -26,7 +26,7 @@ def ramps(subject: Subject) -> RequestRows:
         courses.append([replace(playing, ramp=ramp)])
     for ramp in (subject.ramp, 20):
         courses.append([playing, layer(0, ramp=ramp)])
-    courses.append([replace(playing, ramp=ramp_max), during_ramp, send("Silence", ramp=0)])
+    courses.append([replace(playing, ramp=ramp_max), during_ramp, SILENCE_NOW])
     return courses
 
 

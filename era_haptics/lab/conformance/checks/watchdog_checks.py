@@ -9,7 +9,17 @@ from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.checks.part_checks import long_set
 from era_haptics.lab.conformance.checks.state_checks import rows_while_latched
 from era_haptics.lab.conformance.outcomes import expect_equal
-from era_haptics.lab.conformance.request_rows import RequestRows, Row, layer, play_now, send, stage
+from era_haptics.lab.conformance.request_rows import (
+    DISARM_NOW,
+    SILENCE_NOW,
+    STOP_NOW,
+    RequestRows,
+    Row,
+    layer,
+    play_now,
+    send,
+    stage,
+)
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
@@ -35,7 +45,7 @@ async def watchdog_ranges(subject: Subject) -> None:
     await subject.arm(low / 1000, is_fed=False)
     await subject.settle()
     await subject.run([send("GetFaults"), subject.clear, partial(subject.arm, high / 1000)])
-    await subject.run([send("Disarm", ramp=0)])
+    await subject.run([DISARM_NOW])
 
 
 async def _trip(subject: Subject, time: float, *sets: Row) -> None:
@@ -64,7 +74,7 @@ async def _trip_and_clear(subject: Subject, time: int) -> None:
         [
             *rows_while_latched(subject),
             0.05,
-            send("Stop", ramp=0),
+            STOP_NOW,
             send("Clear", latch=wrong_latch, code="WRONG_LATCH"),
             subject.clear,
             send("Arm", watchdog=time, code="WRONG_SESSION"),
@@ -113,7 +123,7 @@ def what_feeds(subject: Subject) -> RequestRows:
         stage(subject.layer_0(), token=2),
         send("Set", **first_part),
         send("Set", **last_part),  # another part is missing
-        send("Silence", ramp=0),
+        SILENCE_NOW,
         send("Arm", watchdog=subject.can["watchdog_max"]),
     ]
     pause = max(0.02 - subject.exchange_time, 0.0)  # s; until it shows that it was fed
@@ -204,7 +214,7 @@ async def trips_amid_other_requests(subject: Subject) -> None:
         partial(subject.client.exchange, 63, ()),
     )
     judge = subject.judge
-    end = judge.fed[0] + 0.7 * judge.watchdog - subject.exchange_time
+    end = judge.fed.earliest + 0.7 * judge.watchdog - subject.exchange_time
     for row in cycle(rows):
         if threads.now() > end:
             break
@@ -223,7 +233,7 @@ async def fault_list(subject: Subject) -> None:
     expected = [watchdog_fault, watchdog_fault, *await _listed_faults(subject)]
     tone = layer(0, subject.tone())
     trip = partial(_trip, subject, subject.shortest_watchdog / 1000, tone)
-    stop = send("Stop", ramp=0)
+    stop = STOP_NOW
     read = partial(_listed_faults, subject)
     await subject.run([trip, subject.clear, trip, subject.clear, stop, subject.clear, read, 0.1])
     faults = await _listed_faults(subject)

@@ -28,7 +28,6 @@ from era_haptics.lab.conformance.check import ConformanceCheck
 from era_haptics.lab.conformance.checks import state_checks
 from era_haptics.lab.conformance.conformance_report import CheckResult, ConformanceReport, Result
 from era_haptics.lab.conformance.contract import CHECKS, of_kind
-from era_haptics.lab.conformance.dating import When
 from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.outcomes import ContractViolation, TooLate
 from era_haptics.lab.conformance.request_rows import layer
@@ -36,6 +35,7 @@ from era_haptics.lab.conformance.run import ConformanceRun
 from era_haptics.lab.conformance.session import judge
 from era_haptics.lab.conformance.set_text import set_text
 from era_haptics.lab.conformance.subject import Subject
+from era_haptics.lab.expectations.tolerances import Interval
 from kit.clock import (
     JUDGED_LINE_KINDS,
     JudgedLine,
@@ -583,7 +583,7 @@ ARMED = {**OFF, "state": 4, "flags": 1}
 
 def armed(watchdog: int) -> Judge:
     """Return the judge of an amplifier that is armed at 0 s with a watchdog [ms]."""
-    start = When(0.0, 0.0)
+    start = Interval(0.0, 0.0)
     judge = Judge(capabilities(4), OFF, start)
     judge.granted("Arm", {"session": 1, "watchdog": watchdog, "shift": 0}, {}, start)
     return judge
@@ -593,11 +593,11 @@ def armed(watchdog: int) -> Judge:
 def test_fault_may_come_while_a_status_is_on_its_way(age: int) -> None:
     """It was asked for at 0.09 s and came at 0.105 s, amid which the watchdog of 0.1 s tripped."""
     judge = armed(100)
-    judge.check({**ARMED, "watchdog_left": 5}, When(0.09, 0.105))
-    judge.check({**OFF, "state": 7, "fault": 1, "latch": 8}, When(0.105, 0.106))
+    judge.check({**ARMED, "watchdog_left": 5}, Interval(0.09, 0.105))
+    judge.check({**OFF, "state": 7, "fault": 1, "latch": 8}, Interval(0.105, 0.106))
     faults = {"faults": [{"fault": 1, "channel": 255, "age": age}]}
     with nullcontext() if age == 70 else pytest.raises(ContractViolation, match="listed faults"):
-        judge.granted("GetFaults", {}, faults, When(0.17, 0.17))
+        judge.granted("GetFaults", {}, faults, Interval(0.17, 0.17))
 
 
 PART = {"token": 1, "now": 1, "index": 0, "parts": 1, "missing": 0, "exact": 1}
@@ -608,7 +608,7 @@ def expected_by(moment: float, level: float) -> None:
 
     Raises Violation.
     """
-    start, when = When(0.0, 0.0), When(moment, moment)
+    start, when = Interval(0.0, 0.0), Interval(moment, moment)
     judge = armed(1000)
     part = {**PART, "session": 1, "stream": pack_layers([RISE])}
     judge.sets.sent(part)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from era_haptics.lab.design.layout_search import LayoutSearch
 from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
-from era_haptics.lab.design.score import LayoutSearch
 from kit.plates import make_paper_rig, small_problem
 from model.answer.answer_report import Timing
 from model.answer.answer_report import measures as measures_of

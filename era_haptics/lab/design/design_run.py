@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from era_haptics.lab.design.layout_search import LayoutSearch, ScoredLayout
 from era_haptics.lab.design.problem import (
     DEFAULT_ERA_GAP,
     DEFAULT_LOWEST,
@@ -25,7 +26,6 @@ from era_haptics.lab.design.problem import (
 )
 from era_haptics.lab.design.results import Assessment, Design, RankedLayout
 from era_haptics.lab.design.runner import LayoutListener, Machines, Runner, ignore_layout
-from era_haptics.lab.design.score import LayoutSearch, ScoredLayout
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray, best_by, best_first

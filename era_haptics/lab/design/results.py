@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from era_haptics.lab.design.layout_keys import layout_keys
+from era_haptics.lab.design.layout_search import ScoredLayout
 from era_haptics.lab.design.problem import DesignProblem
-from era_haptics.lab.design.score import ScoredLayout
 from model.arrays import FloatArray, IntArray
 from model.config.document import Document
 from model.finger import STRONG_DB_SL

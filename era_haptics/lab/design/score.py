@@ -1,4 +1,4 @@
-"""Fast score of layouts, and a search for ERA positions that maximizes it.
+"""Fast score of ERA layouts.
 
 The score is the expected contrast over sampled contact sets, computed like answers
 (`model.ensemble.expected_power`, `model.drive_modes`), at a few frequencies, from the receptances
@@ -13,63 +13,42 @@ plate, a finger f of dynamic stiffness D and its points p:
 
 where dh comes from the plates thicker and thinner by one standard deviation, each solved exactly
 with half weight, dc from the ERAs' damping, and s_j from each ERA's stiffness and the finger's
-load. The last term is over the plate without fingers, as in `LocalizationTable.error_power`. The
+load. The last term is over the plate without fingers, like `LocalizationTable.error_power`. The
 score of a set is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, minus a
 tenth of the shortfall from the wanted level, since an answer that has to reach the level loses
 little contrast. With several contents it is the score of the worst one, with all other fingers
 quiet, because their crosstalk sums to little more than the highest. Each content is then searched
 at a multiple of the level, since they share the stroke.
-
-The search adds, one ERA after the other, the candidate that raises the score most. Exchanges then
-move one ERA at a time to the best candidate until none improves. Finally every ERA is moved by ever
-smaller steps, independently of the candidates. A list of layouts is a search without steps.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from era_haptics.lab.design.problem import (
-    ANYWHERE,
-    MIN_SUPPORTING,
-    SEARCH_FINGERS,
-    DesignProblem,
-    area_of,
-)
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_by, best_rows
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_rows
 from model.ensemble.attached_plate import mounts_of
 from model.ensemble.expected_power import expected_power, power_of
-from model.errors import InputError
 from model.finger import FIVE_POINTS, STRONG_DB_SL, Grid, detection_threshold, fingertips_on
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import Rig
+from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import coupled_forces
 from model.structure.exciter import Actuator
 
-_LEVEL_RESERVE = 1.2
-"""Factor on the wanted level, as 90 % of plates need more than the nominal plate."""
-
 BEST_FREQUENCIES = 3
 """Frequencies of each set at which the maximum over the quiet fingers is minimized."""
-
-_LAWSON_STEPS = 2
 
 LEVEL_PENALTY = 0.1
 """Score penalty per dB of missing level; with 1 instead of 0 to 0.15, scores predict answers
 worse."""
 
-_LEAST = np.float32(1e-30)
+_LEVEL_RESERVE = 1.2
+"""Factor on the wanted level, as 90 % of plates need more than the nominal plate."""
 
-MAX_SWEEPS = 4
-"""Exchanges of every ERA."""
-
-FINEST_STEP = 0.001
-"""Last step of freely moved positions [m]."""
-
-_GAIN = 0.01  # dB; smaller gains do not justify a move
-_UNSUPPORTED = -100.0  # dB; below the score of every layout that supports the plate
+_LAWSON_STEPS = 2
+_SMALLEST = np.float32(1e-30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +63,41 @@ class PlaceReceptances:
     between: Complex64Array
     to_tips: Complex64Array
     to_plate: Complex64Array
+
+
+class _MountedEras(NamedTuple):
+    """n ERAs at f frequencies; see `model.ensemble.attached_plate.Mounts`."""
+
+    minus_omega2: Float32Array
+    """-w² (f, 1, 1) [rad²/s²]."""
+    stiffness: Complex64Array
+    """Z (f, n) [N/m]."""
+    strokes: Complex64Array
+    """(f, n) [m]."""
+    by_stiffness: Complex64Array
+    """(f, n) [N/m]."""
+    by_damping: Complex64Array
+    """(f, n) [N/m]."""
+    forces: Complex64Array
+    """(f, n) [N]."""
+
+    @property
+    def acceleration_per_transfer(self) -> Complex64Array:
+        """Acceleration [m/s²] at full stroke per unit of receptance, (f, 1, n)."""
+        return np.asarray(self.minus_omega2 * self.forces[:, None])
+
+
+class _TouchedPlates(NamedTuple):
+    """Plates of v thicknesses on n ERAs, each with one of m fingers at its position."""
+
+    transfer: Complex64Array
+    """t (v, f, m, p, n) [m/N]: from the ERAs' forces to the points of the finger."""
+    unloaded: Complex64Array
+    """G_f (v, f, m, n) [m/N]: to the center of the finger, without its load."""
+    own: Complex64Array
+    """L (v, f, m, p) [m/N]: from the center of the finger to its points."""
+    release: Complex64Array
+    """1 / (1 + D L_f) (v, f, m)."""
 
 
 class Scorer:
@@ -102,329 +116,272 @@ class Scorer:
         eras: Sequence[Actuator],
         contents: int = 1,
     ) -> None:
+        plate = rig.plate
+        omega = 2 * np.pi * frequencies
         self._rig = rig
-        self._frequencies, self._omega = frequencies, 2 * np.pi * frequencies
-        uncertainty = rig.uncertainty
-        std = uncertainty.frequency  # a modulus shifts resonances like a thickness
-        self._thicknesses = np.array([1.0, 1 + std, 1 - std] if std > 0 else [1.0])
-        self._mounts = mounts_of(eras, (), self._omega, uncertainty)
-        tip = rig.fingertip
-        finger = np.zeros(len(frequencies)) if tip is None else tip.dynamic_stiffness(self._omega)
-        self._finger = finger.astype(np.complex64)[:, None]
+        self._frequencies = frequencies
         self._contents = contents
-        least = _LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
-        threshold = detection_threshold(frequencies, rig.threshold)
-        self._required = (least * threshold).astype(np.float32)
-        self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
-        centres, numbers = np.unique(np.vstack(sets), axis=0, return_inverse=True)
+        self._thicknesses = _thicknesses_of(rig.uncertainty)
+        self._mounts = mounts_of(eras, (), omega, rig.uncertainty)
+        self._finger_stiffness = _finger_stiffness(rig, omega)
+        self._required = _required_levels(rig, frequencies, contents)
+        self._free = solve_free_plate(plate, rig.mesh, frequency_max=float(frequencies.max()))
+        centers, numbers = np.unique(np.vstack(sets), axis=0, return_inverse=True)
         points, weights = fingertips_on(
-            centres, length=rig.plate.length, width=rig.plate.width, rule=FIVE_POINTS
+            centers, length=plate.length, width=plate.width, rule=FIVE_POINTS
         )
         self._points = points.reshape(-1, 2)
         self._weights: Float32Array = weights.astype(np.float32)  # (m, p), the center first
-        self._cells = np.empty((0, 2))
-        if uncertainty.field > 0:
-            self._cells = Grid(12, 9).centres(rig.plate)
-        # Sets of equal size form one array (s, k).
-        sizes = [len(each) for each in sets]
-        first = np.cumsum(sizes) - sizes
-        self._groups = tuple(
-            numbers.ravel()[first[np.equal(sizes, size)][:, None] + np.arange(size)]
-            for size in np.unique(sizes).tolist()
-        )
-        # From a fingertip's center to its points, (v, f, m, p).
-        every, tips = np.arange(len(centres)), self._solved(centres).to_tips
-        tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
-        self._own = np.moveaxis(tips[:, :, every, :, every], 0, 2)
+        has_field = rig.uncertainty.field > 0
+        self._cells = Grid(12, 9).centres(plate) if has_field else np.empty((0, 2))
+        sizes = [len(contacts) for contacts in sets]
+        self._groups = _grouped_by_size(numbers.ravel(), sizes)
+        self._own = self._own_receptances(centers)
+
+    def _own_receptances(self, centers: FloatArray) -> Complex64Array:
+        """Return the receptances from the center of each fingertip to its points, (v, f, m, p)."""
+        to_tips = self._solved(centers).to_tips
+        by_tip = to_tips.reshape(*to_tips.shape[:2], *self._weights.shape, -1)
+        tips = np.arange(len(centers))
+        return np.moveaxis(by_tip[:, :, tips, :, tips], 0, 2)
 
     def places(self, at: FloatArray) -> PlaceReceptances:
         """Solve for ERAs at positions [m] (c, 2)."""
-        return self._solved(np.column_stack([at, np.full(len(at), self._rig.eras[0].foot)]))
+        foot = self._rig.eras[0].foot
+        return self._solved(np.column_stack([at, np.full(len(at), foot)]))
 
     def _solved(self, footprints: FloatArray) -> PlaceReceptances:
+        loads = self._rig.masses
         between, to_points = self._free.receptances(
             footprints,
             self._points,
             self._frequencies,
-            loads=self._rig.masses,
+            loads=loads,
             thickness=self._thicknesses,
         )
-        to_tips = np.ascontiguousarray(to_points.swapaxes(2, 3), dtype=np.complex64)
         _, to_plate = self._free.receptances(
-            footprints, self._cells, self._frequencies, loads=self._rig.masses
+            footprints, self._cells, self._frequencies, loads=loads
         )
-        over_plate = np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64)
         return PlaceReceptances(
-            footprints[:, :2], between.astype(np.complex64), to_tips, over_plate
+            at=footprints[:, :2],
+            between=between.astype(np.complex64),
+            to_tips=np.ascontiguousarray(to_points.swapaxes(2, 3), dtype=np.complex64),
+            to_plate=np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64),
         )
 
     def mean(self, places: PlaceReceptances, chosen: IntArray) -> float:
         """Return the mean score [dB] of ERAs at chosen positions (n,), equal weight per number of
         fingers."""
-        target, power = self._forms(places, chosen)
-        scores = [self._of_sets(target, power, fingers).mean() for fingers in self._groups]
-        return float(np.mean(scores))
+        target, power = self._fields(places, chosen)
+        means = [self._worst_content(target, power, fingers).mean() for fingers in self._groups]
+        return float(np.mean(means))
 
-    def _of_sets(
+    def _worst_content(
         self, target: Complex64Array, power: Complex64Array, fingers: IntArray
     ) -> FloatArray:
         """Return the score [dB] of the worst content for sets (s, k) of fingers, (s,)."""
-        each = [
-            self._score(target, power, np.roll(fingers, -number, axis=1))
-            for number in range(self._contents)
-        ]
-        return np.asarray(np.min(each, axis=0))
+        scores = []
+        for content in range(self._contents):
+            content_first = np.roll(fingers, -content, axis=1)
+            scores.append(self._score(target, power, content_first))
+        return np.asarray(np.min(scores, axis=0))
 
-    def _forms(
+    # Fields
+
+    def _fields(
         self, places: PlaceReceptances, chosen: IntArray
     ) -> tuple[Complex64Array, Complex64Array]:
         """Return mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n,
         n)."""
-        uncertainty, weights, D = self._rig.uncertainty, self._weights, self._finger
-        m, p = weights.shape
-        n, mounts = len(chosen), self._mounts
-        which = np.minimum(np.arange(n), mounts.stiffness.shape[1] - 1)
-        Z, force, stroke, by_stiffness, by_damping = (
-            each[:, which]
-            for each in (
-                mounts.stiffness,
-                mounts.forces,
-                mounts.strokes,
-                mounts.by_stiffness,
-                mounts.by_damping,
-            )
-        )
-        minus_omega2 = mounts.minus_omega2[:, None, None]
-        # Plates on the ERAs, without fingers; other thicknesses come first.
-        A = places.between[:, :, chosen[:, None], chosen]
-        E = places.to_tips[:, :, :, chosen]
-        v, f = A.shape[:2]
-        K = coupled_forces(A, Z, np.eye(n, dtype=np.complex64))
-        G = E @ K
-
-        # Add the finger at its position.
-        G_f = G[:, :, ::p]
-        held = (E[:, :, ::p] * Z[:, None])[..., None, :] * G.reshape(v, f, m, p, n)
-        L = self._own - held.sum(axis=-1)
-        released = 1 / (1 + D * L[..., 0])  # (v, f, m)
-        reaction = L * (D * released)[..., None]
-        t = G.reshape(v, f, m, p, n) - reaction[..., None] * G_f[:, :, :, None]
-        scale = minus_omega2 * force[:, None]
-        fields = t * scale[:, None]
-        h = fields[0]
-
-        # Sensitivities of the nominal plate.
-        motion = -(A[0] @ (K[0] * force[:, None]))
-        motion.reshape(f, -1)[:, :: n + 1] += stroke
-        t, L, released, G_f = t[0], L[0], released[0], G_f[0]
-        damping = t.reshape(f, -1, n) @ (minus_omega2 * by_damping[:, :, None] * motion)
-        parts = [h, damping.reshape(h.shape), *((fields[1:] - h) * np.float32(math.sqrt(0.5)))]
-        reach = np.sqrt(_mean_power(t, weights)) * -minus_omega2
-        own = reach[..., None] * (by_stiffness[:, :, None] * motion)[:, None]
-        if uncertainty.fingertip > 0:
-            by_load = np.sqrt(_mean_power(L[..., None], weights)) * np.abs(released)[..., None]
-            load = by_load * np.float32(uncertainty.fingertip) * (D * released)[..., None]
-            own = np.concatenate([own, (load * G_f * scale)[:, :, None]], axis=2)
-        error = np.full((f, 1, n), _LEAST)
-        if uncertainty.field > 0:
-            over_plate = places.to_plate[:, :, chosen] @ K[0] * scale
-            mean_square = (np.abs(over_plate) ** 2).mean(axis=1, keepdims=True)
-            error += np.float32(uncertainty.field**2) * mean_square
+        uncertainty = self._rig.uncertainty
+        eras = self._mounted(len(chosen))
+        between = places.between[:, :, chosen[:, None], chosen]
+        identity = np.eye(len(chosen), dtype=np.complex64)
+        coupling = coupled_forces(between, eras.stiffness, identity)  # K
+        plates = self._touched(places.to_tips[:, :, :, chosen], eras, coupling)
+        fields = plates.transfer * eras.acceleration_per_transfer[:, None]
+        nominal = fields[0]
+        motion = -(between[0] @ (coupling[0] * eras.forces[:, None]))  # r_e
+        motion.reshape(len(motion), -1)[:, :: len(chosen) + 1] += eras.strokes
+        by_damping = _field_by_damping(plates.transfer[0], eras, motion)
+        by_thickness = (fields[1:] - nominal) * np.float32(math.sqrt(0.5))
         power = expected_power(
-            parts, own, weights, gain_variance=uncertainty.gain_variance, error_power=error
+            [nominal, by_damping, *by_thickness],
+            self._independent_errors(plates, eras, motion),
+            self._weights,
+            gain_variance=uncertainty.gain_variance,
+            error_power=self._field_error(places, chosen, eras, coupling[0]),
         )
-        return (h * weights[..., None]).sum(axis=2), power
+        mean_field = (nominal * self._weights[..., None]).sum(axis=2)
+        return mean_field, power
+
+    def _mounted(self, count: int) -> _MountedEras:
+        """Return `count` ERAs; additional ones equal the last."""
+        mounts = self._mounts
+        last = mounts.stiffness.shape[1] - 1
+        numbers = np.minimum(np.arange(count), last)
+        return _MountedEras(
+            minus_omega2=mounts.minus_omega2[:, None, None],
+            stiffness=mounts.stiffness[:, numbers],
+            strokes=mounts.strokes[:, numbers],
+            by_stiffness=mounts.by_stiffness[:, numbers],
+            by_damping=mounts.by_damping[:, numbers],
+            forces=mounts.forces[:, numbers],
+        )
+
+    def _touched(
+        self, to_tips: Complex64Array, eras: _MountedEras, coupling: Complex64Array
+    ) -> _TouchedPlates:
+        """Mount plates on ERAs and add each finger; to_tips (v, f, m p, n): of the free plates."""
+        points = self._weights.shape[1]
+        by_tip = (*to_tips.shape[:2], *self._weights.shape, to_tips.shape[-1])
+        unloaded = to_tips @ coupling  # G
+        at_centers = unloaded[:, :, ::points]
+        unloaded = unloaded.reshape(by_tip)
+        to_centers = to_tips[:, :, ::points] * eras.stiffness[:, None]
+        held = to_centers[..., None, :] * unloaded
+        own = self._own - held.sum(axis=-1)
+        release = 1 / (1 + self._finger_stiffness * own[..., 0])
+        reaction = own * (self._finger_stiffness * release)[..., None]
+        transfer = unloaded - reaction[..., None] * at_centers[:, :, :, None]
+        return _TouchedPlates(transfer, at_centers, own, release)
+
+    def _independent_errors(
+        self, plates: _TouchedPlates, eras: _MountedEras, motion: Complex64Array
+    ) -> Complex64Array:
+        """Return the fields (f, m, j, n) of independent errors: each ERA's stiffness, and the
+        finger's load."""
+        reach = np.sqrt(_mean_power(plates.transfer[0], self._weights)) * -eras.minus_omega2
+        by_stiffness = reach[..., None] * (eras.by_stiffness[:, :, None] * motion)[:, None]
+        load_std = self._rig.uncertainty.fingertip
+        if load_std == 0:
+            return np.asarray(by_stiffness)
+        release = plates.release[0]
+        own_size = np.sqrt(_mean_power(plates.own[0][..., None], self._weights))
+        by_load = own_size * np.abs(release)[..., None]
+        load = by_load * np.float32(load_std) * (self._finger_stiffness * release)[..., None]
+        field = load * plates.unloaded[0] * eras.acceleration_per_transfer
+        return np.concatenate([by_stiffness, field[:, :, None]], axis=2)
+
+    def _field_error(
+        self,
+        places: PlaceReceptances,
+        chosen: IntArray,
+        eras: _MountedEras,
+        coupling: Complex64Array,
+    ) -> Float32Array:
+        """Return the power (f, 1, n) of the model's errors, relative to the whole plate."""
+        error = np.full((len(coupling), 1, len(chosen)), _SMALLEST)
+        field_std = self._rig.uncertainty.field
+        if field_std > 0:
+            to_plate = places.to_plate[:, :, chosen]
+            over_plate = to_plate @ coupling * eras.acceleration_per_transfer
+            mean_square = (np.abs(over_plate) ** 2).mean(axis=1, keepdims=True)
+            error += np.float32(field_std**2) * mean_square
+        return error
+
+    # Scores of fields
 
     def _score(
         self, target: Complex64Array, power: Complex64Array, fingers: IntArray
     ) -> FloatArray:
         """Return the score [dB] for sets (s, k) of fingers, (s,); only the first finger has the
         content."""
-        f, _, n = target.shape
-        s, q = len(fingers), fingers.shape[1] - 1
+        frequencies = np.arange(len(target))
         quiet = fingers[:, 1:]
-        c = target[:, fingers[:, 0]].conj()
-        R = power[:, quiet[:, 0]] if q == 1 else power[:, quiet].sum(axis=2) / np.float32(q)
-        w = np.linalg.solve(R, c[..., None])[..., 0]
-        bound = self._decibels(np.vecdot(c, w).real, c, w, np.arange(f)[:, None])
-        if q == 1:
+        quiet_count = quiet.shape[1]
+        c = target[:, fingers[:, 0]].conj()  # (f, s, n)
+        if quiet_count == 1:
+            mean_power = power[:, quiet[:, 0]]
+        else:
+            mean_power = power[:, quiet].sum(axis=2) / np.float32(quiet_count)
+        w = np.linalg.solve(mean_power, c[..., None])[..., 0]
+        # The mean over the quiet fingers bounds the maximum.
+        bound = self._decibels(np.vecdot(c, w).real, c, w, frequencies[:, None])
+        if quiet_count == 1:
             return np.asarray(bound.max(axis=0), dtype=float)
-        kept = min(BEST_FREQUENCIES, f)
-        rows = best_rows(bound, kept)
-        some = (rows, np.arange(s))
-        c, w = c[some], w[some]
-        R = power[rows[..., None], quiet]  # (kept, s, q, n, n)
-        best = np.full(s, -np.inf)
-        shares = np.ones((kept, s, q), dtype=np.float32)
+        rows = best_rows(bound, min(BEST_FREQUENCIES, len(target)))
+        kept = (rows, np.arange(len(fingers)))
+        return self._minimax_score(c[kept], w[kept], power[rows[..., None], quiet], rows)
+
+    def _minimax_score(
+        self, c: Complex64Array, w: Complex64Array, power: Complex64Array, rows: IntArray
+    ) -> FloatArray:
+        """Return the best score [dB] while Lawson's algorithm minimizes the loudest quiet finger.
+
+        c, w (r, s, n): of r frequencies; power (r, s, q, n, n); rows (r, s): frequency numbers.
+        """
+        best = np.full(w.shape[1], -np.inf)
+        shares = np.ones(power.shape[:3], dtype=np.float32)
         for step in range(_LAWSON_STEPS + 1):
-            each = w[:, :, None]
-            expected = np.vecdot(each, np.matvec(R, each)).real
+            by_finger = w[:, :, None]
+            expected = np.vecdot(by_finger, np.matvec(power, by_finger)).real
             peak = np.abs(np.vecdot(c, w))
-            score = peak**2 / np.maximum(expected.max(axis=2), _LEAST)
+            score = peak**2 / np.maximum(expected.max(axis=2), _SMALLEST)
             best = np.maximum(best, self._decibels(score, c, w, rows).max(axis=0))
             if step < _LAWSON_STEPS:
-                shares = shares * np.sqrt(np.maximum(expected, _LEAST))
+                shares = shares * np.sqrt(np.maximum(expected, _SMALLEST))
                 shares /= shares.sum(axis=2, keepdims=True)
-                mean = (shares[:, :, None] @ R.reshape(kept, s, q, -1)).reshape(kept, s, n, n)
-                w = np.linalg.solve(mean, c[..., None])[..., 0]
+                flat_power = power.reshape(*power.shape[:3], -1)
+                weighted = (shares[:, :, None] @ flat_power).reshape(*w.shape, -1)
+                w = np.linalg.solve(weighted, c[..., None])[..., 0]
         return np.asarray(best, dtype=float)
 
     def _decibels(
         self, score: Float32Array, c: Complex64Array, w: Complex64Array, rows: IntArray
     ) -> Float32Array:
         """Return scores (f, s) of weights (f, s, n), minus the penalty for missing level."""
-        level = np.abs(np.vecdot(c, w)) / np.maximum(np.abs(w).max(axis=-1), _LEAST)
-        missing = 20 * np.log10(np.maximum(level, _LEAST) / self._required[rows])
-        return np.asarray(
-            10 * np.log10(np.maximum(score, _LEAST)) + LEVEL_PENALTY * np.minimum(missing, 0)
-        )
+        stroke = np.maximum(np.abs(w).max(axis=-1), _SMALLEST)
+        level = np.abs(np.vecdot(c, w)) / stroke
+        missing = 20 * np.log10(np.maximum(level, _SMALLEST) / self._required[rows])
+        decibels = 10 * np.log10(np.maximum(score, _SMALLEST))
+        return np.asarray(decibels + LEVEL_PENALTY * np.minimum(missing, 0))
+
+
+def _thicknesses_of(uncertainty: Uncertainty) -> FloatArray:
+    """Return relative thicknesses (v,): the nominal plate, then one standard deviation up and down.
+
+    A modulus shifts resonances like a thickness.
+    """
+    std = uncertainty.frequency
+    return np.array([1.0, 1 + std, 1 - std] if std > 0 else [1.0])
+
+
+def _finger_stiffness(rig: Rig, omega: FloatArray) -> Complex64Array:
+    """Return the dynamic stiffness D (f, 1) of a fingertip [N/m], 0 for weightless ones."""
+    if rig.fingertip is None:
+        return np.zeros((len(omega), 1), dtype=np.complex64)
+    return rig.fingertip.dynamic_stiffness(omega).astype(np.complex64)[:, None]
+
+
+def _required_levels(rig: Rig, frequencies: FloatArray, contents: int) -> Float32Array:
+    """Return the acceleration (f,) [m/s²] that each content needs, including a reserve."""
+    factor = _LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
+    return (factor * detection_threshold(frequencies, rig.threshold)).astype(np.float32)
+
+
+def _grouped_by_size(numbers: IntArray, sizes: Sequence[int]) -> tuple[IntArray, ...]:
+    """Group concatenated sets of finger numbers: one array (s, k) for each size k."""
+    starts = np.cumsum(sizes) - sizes
+    groups = []
+    for size in np.unique(sizes).tolist():
+        of_size = starts[np.equal(sizes, size)]
+        groups.append(numbers[of_size[:, None] + np.arange(size)])
+    return tuple(groups)
+
+
+def _field_by_damping(
+    transfer: Complex64Array, eras: _MountedEras, motion: Complex64Array
+) -> Complex64Array:
+    """Return the change dc (f, m, p, n) of the field per standard deviation of the damping.
+
+    transfer (f, m, p, n): of the nominal plate.
+    """
+    flat_transfer = transfer.reshape(len(transfer), -1, transfer.shape[-1])
+    force = eras.minus_omega2 * eras.by_damping[:, :, None] * motion
+    return np.asarray((flat_transfer @ force).reshape(transfer.shape))
 
 
 def _mean_power(values: Complex64Array, weights: Float32Array) -> Float32Array:
     """Return the mean of |values|² (f, m, p, n) over fingertips with weights (m, p), (f, m, n)."""
     return np.asarray((weights[:, None] @ power_of(values))[:, :, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class ScoredLayout:
-    """Layout with positions (n, 2) [m], kept ones first, and its score [dB]."""
-
-    positions: FloatArray
-    score_db: float
-
-    @property
-    def is_supported(self) -> bool:
-        """Return whether it supports the plate."""
-        return self.score_db > _UNSUPPORTED
-
-
-class LayoutSearch:
-    """Searches layouts of a problem; its seed draws the contact sets for the scores."""
-
-    def __init__(self, problem: DesignProblem) -> None:
-        """Solve the plate for all candidates; raises InputError for an area without room."""
-        self.problem = problem
-        kept = problem.kept_positions
-        self._k = len(kept)
-        self._scorer = Scorer(
-            problem.rig,
-            problem.searched_frequencies,
-            problem.contacts.pooled_sets(SEARCH_FINGERS, seed=problem.seed),
-            eras=problem.eras(np.zeros((self._k + 1, 2))),
-            contents=problem.contacts.contents,
-        )
-        self._places = self._scorer.places(np.vstack([kept, problem.candidates]))
-
-    def path(self) -> Iterator[ScoredLayout]:
-        """Yield layouts with increasing numbers of ERAs, starting with the kept or the minimum
-        number."""
-        problem, positions = self.problem, self.problem.kept_positions
-        while len(positions) < problem.count:
-            positions = self.add(positions).positions
-            if len(positions) + problem.supports >= MIN_SUPPORTING:
-                positions = self.exchange(positions, sweeps=1 + (len(positions) == problem.count))
-                yield self.refine(positions)
-        if len(positions) == self._k:
-            yield self.refine(positions)
-
-    def from_random(self, rng: np.random.Generator) -> ScoredLayout:
-        """Search from a random layout; raises InputError if there is no room."""
-        return self.refine(self.exchange(self.problem.random_layout(rng)))
-
-    def add(self, positions: FloatArray) -> ScoredLayout:
-        """Add the best candidate to positions (n, 2) [m]; raises InputError without room."""
-        tried = [np.vstack([positions, place]) for place in self._open(positions)]
-        return best_by(self.scored(tried), _score)
-
-    def exchange(self, positions: FloatArray, *, sweeps: int = MAX_SWEEPS) -> FloatArray:
-        """Move one ERA after the other to the best candidate, until none gains, (n, 2) [m]."""
-        (best,) = self.scored([positions])
-        unchanged, count = 0, len(positions)
-        for number in sweeps * list(range(self._k, count)):
-            rest = np.delete(best.positions, number, axis=0)
-            tried = _replaced(best.positions, number, self._open(rest))
-            found = best_by(self.scored(tried), _score)
-            gains = found.score_db > best.score_db + _GAIN
-            best, unchanged = (found, 0) if gains else (best, unchanged + 1)
-            if unchanged >= count - self._k:
-                break
-        return best.positions
-
-    def one_more(self, positions: FloatArray) -> ScoredLayout | None:
-        """Add the best candidate to positions (n, 2) [m], then move all ERAs; None without room."""
-        try:
-            return self.refine(self.add(positions).positions)
-        except InputError:
-            return None
-
-    def refine(self, positions: FloatArray) -> ScoredLayout:
-        """Refine positions (n, 2) [m] by ever smaller steps."""
-        (best,) = self.scored([positions])
-        step = self.problem.spacing / 2
-        while step >= FINEST_STEP / 2:
-            before = best.score_db
-            for number in range(self._k, len(positions)):
-                moves = self.problem.area.moved(best.positions[number], step)
-                tried = _replaced(best.positions, number, moves)
-                found = self.scored([each for each in tried if self.problem.are_apart(each)])
-                for each in found:
-                    if each.score_db > best.score_db + _GAIN:
-                        best = each
-            if best.score_db <= before + _GAIN:
-                step /= 2
-        return best
-
-    def scored(self, layouts: Sequence[FloatArray]) -> list[ScoredLayout]:
-        """Score layouts (n, 2) [m] without changing them."""
-        if not layouts:
-            return []
-        every = np.unique(np.vstack(layouts), axis=0)
-        is_known = (every[:, None] == self._places.at).all(axis=-1).any(axis=1).all()
-        places = self._places if is_known else self._scorer.places(every)
-        return [ScoredLayout(each, self._score_at(places, each)) for each in layouts]
-
-    def sensitivities(self, positions: FloatArray, *, step: float) -> FloatArray:
-        """Return the largest change of the score [dB] per meter for a step [m] of each ERA,
-        (n,)."""
-        (own,) = self.scored([positions])
-        changes = np.zeros(len(positions))
-        for number, place in enumerate(positions):
-            found = self.scored(_replaced(positions, number, self._steps(place, step)))
-            supported = [abs(each.score_db - own.score_db) for each in found if each.is_supported]
-            changes[number] = max(supported, default=0.0) / step
-        return changes
-
-    def _steps(self, place: FloatArray, step: float) -> FloatArray:
-        """Return steps of a position within the area; anywhere on the plate if it is outside the
-        area."""
-        area, plate = self.problem.area, self.problem.rig.plate
-        if area.contains(place[None])[0]:
-            found = area.moved(place, step)
-            if len(found):
-                return found
-        return area_of(ANYWHERE, plate).moved(place, step)
-
-    def _score_at(self, places: PlaceReceptances, positions: FloatArray) -> float:
-        """Return the score [dB] of positions among `places`, far below 0 if the plate is not
-        supported."""
-        if len(positions) + self.problem.supports >= MIN_SUPPORTING:
-            shortfall = self.problem.shortfall(positions)
-            if shortfall > 0:
-                return _UNSUPPORTED * (1 + shortfall)
-        numbers = (places.at == positions[:, None]).all(axis=-1).argmax(axis=1)
-        return self._scorer.mean(places, numbers)
-
-    def _open(self, positions: FloatArray) -> FloatArray:
-        """Return the candidates [m] far enough from positions (n, 2) [m]; raises InputError for
-        none."""
-        return self.problem.candidates[self.problem.open_candidates(positions)]
-
-
-def _score(found: ScoredLayout) -> float:
-    return found.score_db
-
-
-def _replaced(positions: FloatArray, number: int, places: FloatArray) -> list[FloatArray]:
-    """Return positions (n, 2) with one ERA moved to each of the places (m, 2)."""
-    at = np.arange(len(positions))[:, None] == number
-    return [np.where(at, place, positions) for place in places]

@@ -27,7 +27,7 @@ from cases import read_yaml
 from controller.cli.config_cli import app as config_commands
 from era_haptics.command import run_era
 from era_haptics.lab.cli import app as lab_app
-from era_haptics.lab.design import design_run, problem, score
+from era_haptics.lab.design import design_run, layout_search, problem
 from kit.plates import small_table, smooth_table, write_rig
 from model.cli import app
 from model.commands.options import next_line
@@ -109,7 +109,7 @@ def small(monkeypatch):
     monkeypatch.setitem(problem.CANDIDATES, True, 12)
     monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
     monkeypatch.setattr(problem, "SEARCH_FREQUENCIES", 3)
-    monkeypatch.setattr(score, "FINEST_STEP", 0.02)
+    monkeypatch.setattr(layout_search, "FINEST_STEP", 0.02)
     monkeypatch.setattr(problem, "JUDGED_SETS", 3)
 
 

@@ -16,6 +16,7 @@ import pytest
 from era_haptics.lab.design import problem as problem_module
 from era_haptics.lab.design.design_run import assess, rank_layouts
 from era_haptics.lab.design.layout_keys import layout_keys
+from era_haptics.lab.design.layout_search import LayoutSearch
 from era_haptics.lab.design.problem import (
     Area,
     ContactRule,
@@ -30,7 +31,6 @@ from era_haptics.lab.design.problem import (
 )
 from era_haptics.lab.design.results import Design
 from era_haptics.lab.design.runner import Runner
-from era_haptics.lab.design.score import LayoutSearch
 from kit.plates import exciter_rig_text, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document

@@ -174,9 +174,9 @@ class ExpectedAmplifier:
         """Return the earliest and latest time at which the watchdog trips if it is not fed."""
         if self.watchdog == math.inf:  # not known
             return UNKNOWN
-        shortest = self.watchdog * (1 - DRIFT)
-        longest = (self.watchdog + _TRIP) * (1 + DRIFT)
-        return Interval(self.fed.earliest + shortest - ROUNDED, self.fed.latest + longest)
+        min_time = self.watchdog * (1 - DRIFT)
+        max_time = (self.watchdog + _TRIP) * (1 + DRIFT)
+        return Interval(self.fed.earliest + min_time - ROUNDED, self.fed.latest + max_time)
 
     # Requests
 

@@ -1,7 +1,7 @@
 """Check of a rig file: errors with their keys, and warnings of lost contrast or risk to exciters.
 
 These checks need the wires (`drivers`) and solved plates (`model.study`, `model.transients`).
-Checks that need the values of the rig alone are in `model.rig.rig_summary`.
+Checks that need the values of the rig alone are in `model.rig.rig_warnings`.
 """
 
 import contextlib
@@ -24,14 +24,14 @@ from model.quantities import percent
 from model.rig.rig import Rig
 from model.rig.rig_balance import RigBalance
 from model.rig.rig_file import example_rig_path, rig_of, with_base
-from model.rig.rig_summary import (
+from model.rig.rig_schema import rig_schema
+from model.rig.rig_summary import summary_line
+from model.rig.rig_warnings import (
     exciter_notes,
     gain_notes,
     mount_notes,
     plate_notes,
     resonance_notes,
-    rig_schema,
-    summary_line,
 )
 from model.rig.sections import LimitsSection
 from model.structure.attachments import support_problem
@@ -54,7 +54,7 @@ def check_rig(document: Document) -> CheckedFile:
     problems: list[ConfigProblem] = []
     rig: Rig | None = None
     channels = Counter[str]()
-    limits = LimitsSection().made()
+    limits = LimitsSection().build()
     try:
         rig = rig_of(document)
     except ConfigError as error:

@@ -247,7 +247,7 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
     Example:
         >>> era.draw_map(plate, {"SW": 110}).savefig("map.png")
     """
-    from model.figures import map_figure
+    from model.figures.plate_maps import map_figure
 
     expect_instance(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
     layers = playable_layers(drive, plate.rig)
@@ -263,7 +263,7 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
     Example:
         >>> era.draw_answer(table, only).savefig("answer.png")
     """
-    from model.figures import layer_figure
+    from model.figures.answers import layer_figure
 
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_instance(answer, Answer, what="answer", made_by="era.query(table, target)")
@@ -283,7 +283,7 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     Example:
         >>> era.draw_contents(table, both).savefig("contents.png")
     """
-    from model.figures import contents_figure
+    from model.figures.contents import contents_figure
 
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_instance(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
@@ -310,7 +310,7 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
     Example:
         >>> era.draw_contrast_map(table, found).savefig("contrast.png")
     """
-    from model.figures import contrast_map_figure
+    from model.figures.table_pictures import contrast_map_figure
 
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_instance(found, ContrastMap, what="found", made_by="era.contrast_map(table, quiet)")

@@ -17,9 +17,9 @@ from model.estimate.calibrate import calibrate as fit
 from model.estimate.measurement import measurement_of, read_measured
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
+from model.rig.plate_sections import PlateSection
 from model.rig.rig import Rig
 from model.rig.rig_writing import checked_keys, save_rig
-from model.rig.sections import PlateSection
 
 
 class PlateKeys(dict[str, Any]):

@@ -3,10 +3,25 @@
 import typer
 
 from model.commands.calibrate_cli import calibrate
-from model.commands.plate_cli import plate_app
+from model.commands.plate_cli import (
+    convergence,
+    materials,
+    modes,
+    plate_app,
+    plate_map,
+    template,
+)
+from model.commands.plate_show_cli import show as show_plate
 from model.commands.table_cli import build, contrast_map, export, plot, query, table_app
 from model.commands.table_show_cli import show, verify
 from model.errors import InputError
+
+plate_app.command()(modes)
+plate_app.command("map")(plate_map)
+plate_app.command()(convergence)
+plate_app.command()(materials)
+plate_app.command("show")(show_plate)
+plate_app.command()(template)
 
 table_app.command()(build)
 table_app.command()(show)

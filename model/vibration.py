@@ -30,7 +30,7 @@ from model.quantities import counted
 from model.reduction.free_plate import FiniteElementModes, FreePlate, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.rig import Rig
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.attachments import PointLoad, Source, footprints_of
 from model.structure.exciter import Actuator

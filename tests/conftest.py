@@ -139,7 +139,7 @@ def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
 def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures drawn in a moment, for commands that write some beside what is tested."""
     monkeypatch.setattr("matplotlib.figure.Figure.set_layout_engine", lambda *_, **__: None)
-    monkeypatch.setattr("model.figures.DPI", 20)
+    monkeypatch.setattr("model.figures.style.DPI", 20)
 
 
 @pytest.fixture(scope="session")

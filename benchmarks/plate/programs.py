@@ -24,7 +24,7 @@ from benchmarks.plate.problem import (
 from model.arrays import ComplexArray, FloatArray
 from model.reduction import free_plate
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.spectral import polynomials
 from model.structure.attachments import Era
 

@@ -34,10 +34,10 @@ from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
-from model.rig.actuator_keys import Identifier
+from model.rig.key_types import Identifier
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of, with_base
-from model.rig.rig_summary import gain_notes
+from model.rig.rig_warnings import gain_notes
 from model.structure.attachments import check_supported
 from registry.limits import MAX_CONTACTS, MAX_FINGERS
 

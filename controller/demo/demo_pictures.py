@@ -13,15 +13,9 @@ from controller.demo.touch_rows import TouchRow
 from model.answer.answer import Sensation
 from model.answer.stimulus import Finger
 from model.arrays import ranked_by
-from model.figures import (
-    PAGE_WIDTH,
-    SMALL_TEXT,
-    contents_figure,
-    draw_fingertip,
-    draw_level_scale,
-    draw_levels,
-    save_figure,
-)
+from model.figures.answers import draw_fingertip, draw_level_scale, draw_levels
+from model.figures.contents import contents_figure
+from model.figures.style import PAGE_WIDTH, SMALL_TEXT, save_figure
 from model.table.table import LocalizationTable
 
 MAX_PANELS = 6

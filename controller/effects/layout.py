@@ -34,7 +34,7 @@ from model.config.fields import Quantity, Section, ShapedSection, Validation
 from model.config.units import LEVEL
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
-from model.rig.actuator_keys import Identifier
+from model.rig.key_types import Identifier
 from model.structure.plate import Plate
 from registry.plugins import did_you_mean
 

@@ -5,18 +5,18 @@ from functools import partial
 
 from key_tables import key_table
 from model.config.fields import Section
-from model.rig import sections
+from model.rig import plate_sections, sections
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.structure.attachments import FEET, FOOT_LOSS
 from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
 
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,
-    "plate": sections.PlateSection,
-    "surface": sections.SurfaceSection,
-    "layers": sections.LayerSection,
-    "air_gap": sections.AirGapSection,
-    "material": sections.MaterialSection,
+    "plate": plate_sections.PlateSection,
+    "surface": plate_sections.SurfaceSection,
+    "layers": plate_sections.LayerSection,
+    "air_gap": plate_sections.AirGapSection,
+    "material": plate_sections.MaterialSection,
     "eras": EraSection,
     "exciters": ExciterSection,
     "masses": sections.MassSection,

@@ -20,7 +20,7 @@ from model.answer.envelope import ONSET_RAMP
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import FloatArray
-from model.figures import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, save_figure
+from model.figures.style import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, save_figure
 from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig

@@ -20,11 +20,13 @@ from matplotlib.patches import Rectangle
 
 from model.arrays import FloatArray, best_by, best_of, lattice
 from model.errors import InputError
-from model.figures import MapPanel, draw_eras, label_plate, maps_figure, raster, save_figure
+from model.figures.plate_maps import MapPanel, maps_figure, raster
+from model.figures.style import draw_eras, label_plate, save_figure
 from model.files.csv_file import Columns, write_columns
 from model.finger import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.rig import FOUR_ERA_LAYOUTS, Rig, alike
+from model.rig.era_layouts import FOUR_ERA_LAYOUTS, alike
+from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate

@@ -169,7 +169,8 @@ def calibrate(
         else []
     )
     if picture is not None:
-        from model.figures import calibration_figure, save_figure
+        from model.figures.calibration import calibration_figure
+        from model.figures.style import save_figure
 
         save_figure(calibration_figure(calibration), picture)
         files.append(str(picture))

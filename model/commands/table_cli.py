@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from model.commands.options import (
+    FAILED,
     FolderOption,
     JsonOption,
     MeshOption,
@@ -38,6 +39,7 @@ from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.study.contrast_maps import ContrastMap
+    from model.table.table import LocalizationTable
 
 _MAX_LINE = 1 << 20  # characters of a question in a batch
 _MAX_EMPTY = 1000  # lines before the first question
@@ -78,7 +80,6 @@ def build(
     from model.drive_modes import checked_mode
     from model.finger import Grid
     from model.rig.rig_file import load_rig
-    from model.structure.surface import WELL_KNOWN
     from model.table.table import default_drive_frequencies
     from model.table.table_file import ZIP, TableProblem, save_table, solve_table
 
@@ -87,22 +88,27 @@ def build(
     check_ending(output, ".npz", what="a localization table")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
     rig = load_rig(rig_file, mesh=mesh)
-    chosen = (
-        parse_frequencies(frequencies) if frequencies else default_drive_frequencies(rig.limits)
-    )
-    problem = TableProblem(rig, chosen, Grid(*parse_pair(grid, what="--grid")))
+    if frequencies:
+        drive_frequencies = parse_frequencies(frequencies)
+    else:
+        drive_frequencies = default_drive_frequencies(rig.limits)
+    problem = TableProblem(rig, drive_frequencies, Grid(*parse_pair(grid, what="--grid")))
     with Stopwatch() as timed, progress_bar("parts") as progress:
         table = solve_table(problem, drive_mode=drive_mode, workers=workers, progress=progress)
     save_table(table, output)
     error = 100 * float(table.discretisation_error.max())
+    if rig.plate.surface is None:
+        mesh_row = (
+            f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
+            f"{table.reference_mesh}"
+        )
+    else:
+        mesh_row = f"{table.mesh}: error of the fields {error:.3g} %, by what others may add"
     rows = [
         f"{counted(table.pattern_count, 'pattern')} of "
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
         f"{counted(table.grid.cell_count, 'cell')}, built in {timed.elapsed:.2f} s",
-        f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
-        f"{table.reference_mesh}"
-        if rig.plate.surface is None
-        else f"{table.mesh}: error of the fields {error:.3g} %, by what others may add",
+        mesh_row,
         rig.uncertainty_note,
         f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
         next_line("era", "table", "show", output),
@@ -122,20 +128,30 @@ def build(
         "files": [str(output)],
     }
     print_report(rows, answer, as_json=as_json)
-    coarse = (
-        f"mesh {table.mesh} is coarse: its fields have errors of {error:.3g} %, which lower the "
-        "promises; `mesh: auto` chooses a mesh for about 1 %"
-    )
-    if rig.plate.surface is not None:
-        coarse = (
-            f"surface: fields from {table.mesh} have errors of {error:.3g} %, which lower the "
-            "promises; export modes up to "
-            f"{max(WELL_KNOWN * chosen[-1], 2 * table.mesh.highest_frequency(rig.plate)):.0f} Hz"
-        )
-    shown_if_coarse = coarse if error >= _COARSE_ERROR else None
-    for warning in (*rig.surface_notes, shown_if_coarse, why_slow()):
+    for warning in (*rig.surface_notes, _mesh_warning(table), why_slow()):
         if warning:
             typer.echo(f"era: warning: {warning}", err=True)
+
+
+def _mesh_warning(table: "LocalizationTable") -> str | None:
+    """Return a warning if the fields of a table have large errors, else None."""
+    from model.structure.surface import WELL_KNOWN
+
+    error = 100 * float(table.discretisation_error.max())
+    if error < _COARSE_ERROR:
+        return None
+    if table.plate.surface is None:
+        return (
+            f"mesh {table.mesh} is coarse: its fields have errors of {error:.3g} %, which lower "
+            "the promises; `mesh: auto` chooses a mesh for about 1 %"
+        )
+    frequency = max(
+        WELL_KNOWN * table.frequencies[-1], 2 * table.mesh.highest_frequency(table.plate)
+    )
+    return (
+        f"surface: fields from {table.mesh} have errors of {error:.3g} %, which lower the "
+        f"promises; export modes up to {frequency:.0f} Hz"
+    )
 
 
 def query(
@@ -197,18 +213,16 @@ def query(
         }
         _query_batch(table_file, batch, defaults)
         return
-    no_target = (
-        "targets must be at least one, got none; give --target X,Y or --own X,Y, meters, or "
-        "--batch FILE"
-    )
-    for is_wrong, said in (
-        (swap_bands and not own, "--swap-bands must be given with --own"),
-        (own and target, "--own must be given without --target"),
-        (not (target or own), no_target),
-    ):
-        if is_wrong:
-            raise InputError(said)
-    given = {
+    if swap_bands and not own:
+        raise InputError("--swap-bands must be given with --own")
+    if own and target:
+        raise InputError("--own must be given without --target")
+    if not (target or own):
+        raise InputError(
+            "targets must be at least one, got none; give --target X,Y or --own X,Y, meters, or "
+            "--batch FILE"
+        )
+    keys = {
         "targets": [parse_point(text, what="--target") for text in target or []],
         "own": [_own(text) for text in own or []],
         "quiet": [parse_point(text, what="--quiet") for text in quiet or []],
@@ -216,7 +230,7 @@ def query(
         "envelopes": envelopes,
         "bands_may_swap": swap_bands,
     }
-    line = {key: value for key, value in given.items() if value} | {"level_db_sl": level}
+    line = {key: value for key, value in keys.items() if value} | {"level_db_sl": level}
     table = load_table(table_file)
     answer = query_one(table, line)
     rows = [
@@ -230,10 +244,12 @@ def query(
 
 
 def _own(text: str) -> dict[str, Any]:
-    """Parse X,Y[@LOW-HIGH], a finger with a vibration of its own."""
-    place, separator, band = text.partition("@")
-    at = parse_point(place, what="--own")
-    return {"at": at, "band_hz": _band(band)} if separator else {"at": at}
+    """Parse X,Y[@LOW-HIGH], a finger with its own vibration."""
+    position, separator, band = text.partition("@")
+    finger: dict[str, Any] = {"at": parse_point(position, what="--own")}
+    if separator:
+        finger["band_hz"] = _band(band)
+    return finger
 
 
 def _band(text: str) -> tuple[float, float]:
@@ -248,11 +264,11 @@ def _band(text: str) -> tuple[float, float]:
         ) from None
 
 
-def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
+def _rows_of_layers(answer: dict[str, Any]) -> Iterator[str]:
     """Yield the drive of a single layer; with several, the fingers' rows show the frequencies."""
-    if len(found["layers"]) != 1:
+    if len(answer["layers"]) != 1:
         return
-    (layer,) = found["layers"]
+    (layer,) = answer["layers"]
     for era, tone in layer["drive"].items():
         yield (
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
@@ -262,7 +278,7 @@ def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
         yield "level: the threshold is extrapolated at this frequency"
 
 
-def _rows_of_fingers(found: dict[str, Any], threshold_sets: Sequence[str]) -> Iterator[str]:
+def _rows_of_fingers(answer: dict[str, Any], threshold_sets: Sequence[str]) -> Iterator[str]:
     """Yield one line per finger with its vibration and verdict, then the changes made.
 
     threshold_sets: names, the rig's set first.
@@ -272,9 +288,9 @@ def _rows_of_fingers(found: dict[str, Any], threshold_sets: Sequence[str]) -> It
 
     yield f"{scale_in_words(threshold_sets[0])}; contrasts are the lowest over all threshold sets"
     yield "finger [m]         frequency       level    contrast  nominal  foreign level    exposure"
-    for finger in found["fingers"]:
+    for finger in answer["fingers"]:
         layer = finger["layer"]
-        frequency = None if layer is None else found["layers"][layer]["frequency_hz"]
+        frequency = None if layer is None else answer["layers"][layer]["frequency_hz"]
         yield (
             f"{_place(finger):18s} {_cell(frequency, 'Hz'):>9s} "
             f"{_cell(finger['promised_level_db_sl'], 'dB SL'):>11s} "
@@ -284,32 +300,32 @@ def _rows_of_fingers(found: dict[str, Any], threshold_sets: Sequence[str]) -> It
             f"{finger['exposure_m_s2']:6.2f} m/s²  "
             f"{verdict_shown(finger['verdict'], is_foreign_felt=finger['is_foreign_felt'])}"
         )
-    if found["promised_worst_db"] is not None:
-        yield f"worst finger: {found['promised_worst_db']:.1f} dB promised"
-    for line in found["applied"]:
+    if answer["promised_worst_db"] is not None:
+        yield f"worst finger: {answer['promised_worst_db']:.1f} dB promised"
+    for line in answer["applied"]:
         yield f"changed: {line}"
 
 
-def _rows_of_measures(found: dict[str, Any]) -> Iterator[str]:
+def _rows_of_measures(answer: dict[str, Any]) -> Iterator[str]:
     """Yield the further measures of an answer with one vibration."""
-    if "residual_db" not in found:
+    if "residual_db" not in answer:
         return
-    rows = [("residual after the end", found["residual_db"], "dB nominal")]
-    is_imperceptible = found["is_imperceptible_to_quiet"]
+    rows = [("residual after the end", answer["residual_db"], "dB nominal")]
+    is_imperceptible = answer["is_imperceptible_to_quiet"]
     if is_imperceptible is not None:
-        rows.append(("contrast in the first 100 ms", found["transient_contrast_db"], "dB nominal"))
-        is_felt = "not felt, 10 dB below all threshold sets" if is_imperceptible else "may feel it"
-        yield f"quiet fingers: {is_felt}"
+        rows.append(("contrast in the first 100 ms", answer["transient_contrast_db"], "dB nominal"))
+        effect = "not felt, 10 dB below all threshold sets" if is_imperceptible else "may feel it"
+        yield f"quiet fingers: {effect}"
     else:
         rows += [
             (
                 "contrast to rest of the plate",
-                found["layers"][0]["contrast_to_plate_db"],
+                answer["layers"][0]["contrast_to_plate_db"],
                 "dB nominal",
             ),
-            ("  to its 95th percentile", found["surroundings_contrast_95_db"], "dB nominal"),
-            ("area above half the target", 1e4 * found["area_above_half_m2"], "cm²"),
-            ("energy within 5 cm", 100 * found["energy_share_near"], "%"),
+            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB nominal"),
+            ("area above half the target", 1e4 * answer["area_above_half_m2"], "cm²"),
+            ("energy within 5 cm", 100 * answer["energy_share_near"], "%"),
         ]
     for name, value, unit in rows:
         yield f"{name:30s} {value:z6.1f} {unit}"
@@ -331,21 +347,13 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
     """
     from model.answer.answer_report import query_batch
     from model.table.table_file import load_table
-    from registry.files import regular_file
 
     table = load_table(table_file)
-    has_failed = False
     is_piped = batch == Path("-")
+    has_failed = False
     try:
-        with (
-            nullcontext(sys.stdin)
-            if is_piped
-            else open(batch, encoding="utf-8", opener=regular_file)
-        ) as lines:
-            bounded = iter(partial(lines.readline, _MAX_LINE), "")
-            if not is_piped:
-                bounded = _questions_of(batch, bounded)
-            for answer in query_batch(table, bounded, defaults):
+        with _lines_of_batch(batch, is_piped=is_piped) as lines:
+            for answer in query_batch(table, lines, defaults):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer), flush=is_piped)
     except BrokenPipeError:
@@ -357,7 +365,19 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
     except UnicodeDecodeError as error:
         raise InputError(f"--batch {batch} must be UTF-8; save it as UTF-8") from error
     if has_failed:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _lines_of_batch(batch: Path, *, is_piped: bool) -> Iterator[Iterator[str]]:
+    """Yield the questions in a file, or on standard input; long lines are cut."""
+    from registry.files import regular_file
+
+    if is_piped:
+        yield iter(partial(sys.stdin.readline, _MAX_LINE), "")
+        return
+    with open(batch, encoding="utf-8", opener=regular_file) as file:
+        yield _questions_of(batch, iter(partial(file.readline, _MAX_LINE), ""))
 
 
 def _questions_of(batch: Path, lines: Iterator[str]) -> Iterator[str]:
@@ -420,7 +440,7 @@ def contrast_map(
     places = Grid(*parse_pair(grid, what="--grid")) if grid else None
     table = load_table(table_file)
     with Stopwatch() as timed, progress_bar("places") as progress:
-        found = map_contrast(
+        contrast = map_contrast(
             table,
             fingers,
             drive_modes=[mode.strip() for mode in modes.split(",")] if modes else (),
@@ -431,37 +451,41 @@ def contrast_map(
     if output is not None and is_csv:
         from model.files.csv_file import write_columns
 
-        write_columns(output, found.columns)
+        write_columns(output, contrast.columns)
     elif output is not None:
-        from model.figures import contrast_map_figure, save_figure
+        from model.figures.style import save_figure
+        from model.figures.table_pictures import contrast_map_figure
 
-        save_figure(contrast_map_figure(table, found), output, inches=inches)
+        save_figure(contrast_map_figure(table, contrast), output, inches=inches)
     words = [word for text in quiet for word in ("--quiet", text)]
-    target = f"{found.x[0]:.3g},{found.y[0]:.3g}"
+    target = f"{contrast.x[0]:.3g},{contrast.y[0]:.3g}"
+    written = "" if output is None else f"; wrote {output}"
     rows = [
-        *_map_rows(found),
-        f"computed in {timed.elapsed:.1f} s{'' if output is None else f'; wrote {output}'}",
+        *_map_rows(contrast),
+        f"computed in {timed.elapsed:.1f} s{written}",
         next_line("era", "table", "query", table_file, "--target", target, *words),
     ]
     files = [] if output is None else [str(output)]
-    answer = found.as_json() | {"solve_time_s": timed.elapsed, "files": files}
+    answer = contrast.as_json() | {"solve_time_s": timed.elapsed, "files": files}
     print_report(rows, answer, as_json=as_json)
 
 
-def _map_rows(found: "ContrastMap") -> Iterator[str]:
+def _map_rows(contrast: "ContrastMap") -> Iterator[str]:
     """Yield a map for each drive mode, largest y first, each with its percentiles."""
     import numpy as np
 
-    for mode, promised in found.promised_db.items():
+    for mode, promised in contrast.promised_db.items():
         yield f"{mode}: promised felt contrast to the quiet fingers, dB"
         for row in promised[::-1]:
             yield "".join("   -" if np.isnan(value) else f"{value:4.0f}" for value in row)
-        known, nominal = (of[np.isfinite(of)] for of in (promised, found.nominal_db[mode]))
-        if len(known):
-            low, median, high = np.percentile(known, [10, 50, 90])
+        finite = promised[np.isfinite(promised)]
+        nominal = contrast.nominal_db[mode]
+        if len(finite):
+            low, median, high = np.percentile(finite, [10, 50, 90])
+            median_nominal = np.median(nominal[np.isfinite(nominal)])
             yield (
                 f"median {median:.1f} dB, one place in ten below {low:.1f}, one above {high:.1f}; "
-                f"median nominal {np.median(nominal):.1f}"
+                f"median nominal {median_nominal:.1f}"
             )
         yield ""
 
@@ -476,7 +500,8 @@ def plot(
     as_json: JsonOption = False,
 ) -> None:
     """Draw a table's weak cells, levels, contrast and a sample answer."""
-    from model.figures import save_figure, table_figures
+    from model.figures.style import save_figure
+    from model.figures.table_pictures import table_figures
     from model.study.overview import find_overview
     from model.table.table_file import load_table
 

@@ -56,7 +56,7 @@ from model.finger import Grid
 from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.spectral.direct_solution import grain_slopes
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_is_plate, check_measurable, lowest_elastic

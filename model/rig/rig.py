@@ -1,8 +1,6 @@
 """Rig: a plate, its ERAs, their amplifier channels, and their uncertainties.
 
-Also defines which parts of a rig must match a table (`physics_of`), and named layouts of ERAs. The
-drawings of the paper's layouts (its Figures 8 and 9) are not available, so the layouts here are our
-own. Their positions are fractions of the plate's length and width, so that they fit every plate.
+`physics_of` returns the properties of a rig that must match a table.
 """
 
 import hashlib
@@ -10,20 +8,17 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from numbers import Real
 from typing import Any
 
-import numpy as np
-
-from model.arrays import FloatArray
 from model.config.document import Document
 from model.errors import InputError, expect_between
 from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import FEET_DEVIATE, Fingertip, PointLoad, feet_of
-from model.structure.exciter import Actuator, OneKind
+from model.structure.exciter import Actuator
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.plugins import did_you_mean
@@ -126,28 +121,30 @@ class Uncertainty:
     @classmethod
     def clipped(cls, **estimates: float) -> "Uncertainty":
         """Return an uncertainty from estimates, each clipped to BOUNDS."""
-        return cls(
-            **{
-                key: min(max(value, BOUNDS[key][0]), BOUNDS[key][1])
-                for key, value in estimates.items()
-            }
-        )
+        clipped = {}
+        for key, value in estimates.items():
+            low, high = BOUNDS[key]
+            clipped[key] = min(max(value, low), high)
+        return cls(**clipped)
 
     def __str__(self) -> str:
         """Format the terms that are uncertain, as 'gain 5 %, phase 5°, damping x 1.5'."""
-        percents = [
-            f"{key.replace('_', ' ')} {100 * getattr(self, key):.3g} %"
-            for key in _RELATIVE
-            if getattr(self, key)
-        ]
-        others = [
-            f"phase {self.phase_deg:.3g}°" if self.phase_deg else "",
-            f"damping x {self.damping:.4g}" if self.damping > 1 else "",
-            f"fingertip x {math.exp(self.fingertip):.2g}" if self.fingertip else "",
-            f"place {1e3 * self.place:.3g} mm" if self.place else "",
-            f"foreign mass {1e3 * self.foreign_mass:.3g} g" if self.foreign_mass else "",
-        ]
-        return ", ".join([*percents, *filter(None, others)]) or "none"
+        terms = []
+        for key in _RELATIVE:
+            share = getattr(self, key)
+            if share:
+                terms.append(f"{key.replace('_', ' ')} {100 * share:.3g} %")
+        if self.phase_deg:
+            terms.append(f"phase {self.phase_deg:.3g}°")
+        if self.damping > 1:
+            terms.append(f"damping x {self.damping:.4g}")
+        if self.fingertip:
+            terms.append(f"fingertip x {math.exp(self.fingertip):.2g}")
+        if self.place:
+            terms.append(f"place {1e3 * self.place:.3g} mm")
+        if self.foreign_mass:
+            terms.append(f"foreign mass {1e3 * self.foreign_mass:.3g} g")
+        return ", ".join(terms) or "none"
 
     @property
     def gain_variance(self) -> float:
@@ -160,8 +157,8 @@ class Uncertainty:
 
     @property
     def elasticity(self) -> float:
-        """Relative standard deviation of the modulus; only due to weather if the thickness is
-        known."""
+        """Relative standard deviation of the modulus; only due to weather for an exactly known
+        thickness."""
         return math.hypot(self.modulus if self.thickness > 0 else 0.0, self.weather)
 
     @property
@@ -176,14 +173,13 @@ class Uncertainty:
 
     @staticmethod
     def of_frequency(std: float) -> dict[str, float]:
-        """Return equal uncertainties of thickness and modulus that give this one of natural
-        frequencies."""
-        each = std / math.hypot(1.0, 0.5)
-        return {"thickness": each, "modulus": each}
+        """Return equal uncertainties of thickness and modulus that give a relative standard
+        deviation of natural frequencies."""
+        share = std / math.hypot(1.0, 0.5)
+        return {"thickness": share, "modulus": share}
 
 
-# m; two bolts cannot be closer
-SAME_POINT = 1e-6
+SAME_POINT = 1e-6  # m; two bolts cannot be closer
 
 
 @dataclass(frozen=True)
@@ -231,26 +227,21 @@ class Rig:
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, with unique positions and names of ERAs."""
-        for what, place in (
-            *((f"ERA {era.name}", (era.x, era.y)) for era in self.eras),
-            *(("point mass", (mass.x, mass.y)) for mass in self.masses),
-        ):
-            if not self.plate.contains(*place):
-                raise InputError(
-                    f"{what} must be on the plate, from (0, 0) to ({self.plate.length:g}, "
-                    f"{self.plate.width:g}) m, got ({place[0]:g}, {place[1]:g}) m"
-                )
+        for era in self.eras:
+            self._check_on_plate(f"ERA {era.name}", era.x, era.y)
+        for mass in self.masses:
+            self._check_on_plate("point mass", mass.x, mass.y)
         for number, era in enumerate(self.eras):
-            for other in self.eras[:number]:
-                if era.name == other.name:
-                    raise InputError(
-                        f"names of ERAs must be unique, got {era.name} twice; rename one"
-                    )
-                if math.dist((era.x, era.y), (other.x, other.y)) < SAME_POINT:
-                    raise InputError(
-                        f"ERAs must be at different positions, got {other.name} and {era.name} at "
-                        f"({era.x:g}, {era.y:g}) m; move one ERA"
-                    )
+            for earlier in self.eras[:number]:
+                _check_distinct(earlier, era)
+
+    def _check_on_plate(self, what: str, x: float, y: float) -> None:
+        plate = self.plate
+        if not plate.contains(x, y):
+            raise InputError(
+                f"{what} must be on the plate, from (0, 0) to ({plate.length:g}, "
+                f"{plate.width:g}) m, got ({x:g}, {y:g}) m"
+            )
 
     def era(self, name: str) -> Actuator:
         """Return an ERA by name; raises InputError for an unknown name."""
@@ -306,9 +297,9 @@ class Rig:
     @property
     def foot_names(self) -> tuple[str, ...]:
         """Names of the feet in its file; a foot without a name has its number from 1."""
-        stated: Any = self.document.data.get("supports", {}) if self.document else {}
-        named = [name for name, keys in stated.items() if "at" in keys]
-        return tuple(named or [str(number) for number in range(1, 1 + len(self.feet))])
+        supports: Any = self.document.data.get("supports", {}) if self.document else {}
+        names = [name for name, keys in supports.items() if "at" in keys]
+        return tuple(names or map(str, range(1, 1 + len(self.feet))))
 
     @property
     def largest_stiffness(self) -> float:
@@ -324,6 +315,17 @@ class Rig:
     def fingerprint(self) -> str:
         """Fingerprint of all properties that affect the sensation; see `fingerprint_of`."""
         return fingerprint_of(self)
+
+
+def _check_distinct(first: Actuator, second: Actuator) -> None:
+    """Raise InputError if two ERAs have the same name or position."""
+    if first.name == second.name:
+        raise InputError(f"names of ERAs must be unique, got {first.name} twice; rename one")
+    if math.dist((first.x, first.y), (second.x, second.y)) < SAME_POINT:
+        raise InputError(
+            f"ERAs must be at different positions, got {first.name} and {second.name} at "
+            f"({second.x:g}, {second.y:g}) m; move one ERA"
+        )
 
 
 MAY_DIFFER = {
@@ -345,36 +347,36 @@ MAY_DIFFER = {
 All other fields, including every new field, must match.
 """
 
-PHYSICS = tuple(each.name for each in fields(Rig) if f"Rig.{each.name}" not in MAY_DIFFER)
+PHYSICS = tuple(field.name for field in fields(Rig) if f"Rig.{field.name}" not in MAY_DIFFER)
 """Fields of a rig that are also stored in a table."""
 
 
-def physics_of(of: object) -> dict[str, Any]:
+def physics_of(source: object) -> dict[str, Any]:
     """Return the properties of a rig or a table that must match for equal answers, as plain data.
 
-    of: a rig, or an object with its PHYSICS. Fields by name, without empty defaults, so that tables
-    from before a field existed stay valid.
+    source: a rig, or an object with its PHYSICS. Fields by name, without empty defaults, so that
+    tables from before a field existed stay valid.
     """
-    found = {name: _plain(getattr(of, name)) for name in PHYSICS}
+    physics = {name: _plain(getattr(source, name)) for name in PHYSICS}
     # A laminate keeps its layers; its equivalent plate depends on the frequency.
-    if "laminate" in found["plate"]:
-        del found["plate"]["material"], found["plate"]["thickness"]
-    found["masses"].sort(key=canonical_json)
-    found["names of eras"] = [era["name"] for era in found["eras"]]
-    found["eras"] = {era["name"]: era for era in found["eras"]}
-    return found | {"fingertip_radius": FINGERTIP_RADIUS}
+    if "laminate" in physics["plate"]:
+        del physics["plate"]["material"], physics["plate"]["thickness"]
+    physics["masses"].sort(key=canonical_json)
+    physics["names of eras"] = [era["name"] for era in physics["eras"]]
+    physics["eras"] = {era["name"]: era for era in physics["eras"]}
+    return physics | {"fingertip_radius": FINGERTIP_RADIUS}
 
 
-def fingerprint_of(of: object) -> str:
+def fingerprint_of(source: object) -> str:
     """Return the SHA-256 of `physics_of` a rig or a table: all properties that affect the
     sensation."""
-    return hashlib.sha256(canonical_json(physics_of(of)).encode()).hexdigest()
+    return hashlib.sha256(canonical_json(physics_of(source)).encode()).hexdigest()
 
 
-def differences(of: object, rig: Rig) -> list[str]:
+def differences(table: object, rig: Rig) -> list[str]:
     """Describe the keys in which a table's values must match a rig's but differ by more than
     rounding."""
-    return [*_differing("", physics_of(of), physics_of(rig))]
+    return [*_differences("", physics_of(table), physics_of(rig))]
 
 
 def _plain(value: Any) -> Any:
@@ -386,80 +388,40 @@ def _plain(value: Any) -> Any:
         case Real():
             return float(value) + 0.0
         case Mapping():
-            return {key: _plain(each) for key, each in value.items()}
+            return {key: _plain(entry) for key, entry in value.items()}
         case Iterable():
-            return [_plain(each) for each in value]
-    kept = [f for f in fields(value) if f"{type(value).__name__}.{f.name}" not in MAY_DIFFER]
-    own = [(each, getattr(value, each.name)) for each in kept]
-    return {each.name: _plain(held) for each, held in own if held or held != each.default}
+            return [_plain(entry) for entry in value]
+    properties = {}
+    for attribute in fields(value):
+        content = getattr(value, attribute.name)
+        is_empty_default = not content and content == attribute.default
+        if f"{type(value).__name__}.{attribute.name}" not in MAY_DIFFER and not is_empty_default:
+            properties[attribute.name] = _plain(content)
+    return properties
 
 
-def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
+def _differences(key: str, actual: Any, expected: Any) -> Iterator[str]:
     """Yield differences of plain data below a key; a list of another length differs as a whole."""
-    if isinstance(own, dict) and isinstance(rigs, dict):
-        for name in rigs | own:
-            yield from _differing(f"{key}.{name}".lstrip("."), own.get(name), rigs.get(name))
-    elif isinstance(own, list) and isinstance(rigs, list) and len(own) == len(rigs):
-        for number, pair in enumerate(zip(own, rigs, strict=True)):
-            yield from _differing(f"{key}[{number}]", *pair)
-    elif own != rigs and not (type(own) is type(rigs) is float and math.isclose(own, rigs)):
-        wanted, got = (f"{each:.9g}" if type(each) is float else each for each in (rigs, own))
-        yield f"{key} must be {wanted!s:.60}, got {got!s:.60}"
+    if isinstance(actual, dict) and isinstance(expected, dict):
+        for name in expected | actual:
+            path = f"{key}.{name}".lstrip(".")
+            yield from _differences(path, actual.get(name), expected.get(name))
+    elif isinstance(actual, list) and isinstance(expected, list) and len(actual) == len(expected):
+        for number, (entry, expected_entry) in enumerate(zip(actual, expected, strict=True)):
+            yield from _differences(f"{key}[{number}]", entry, expected_entry)
+    elif actual != expected and not _are_close(actual, expected):
+        yield f"{key} must be {_in_digits(expected):.60}, got {_in_digits(actual):.60}"
+
+
+def _are_close(value: Any, expected: Any) -> bool:
+    """Return whether two values are numbers that differ by no more than rounding."""
+    return type(value) is type(expected) is float and math.isclose(value, expected)
+
+
+def _in_digits(value: Any) -> str:
+    return f"{value:.9g}" if type(value) is float else str(value)
 
 
 def canonical_json(value: object) -> str:
     """Return JSON with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
     return json.dumps(_plain(value), sort_keys=True, separators=(",", ":"))
-
-
-RelativePlace = tuple[float, float]
-"""Position of an ERA as fractions of length and width, 0 to 1."""
-
-
-@dataclass(frozen=True)
-class EraLayout:
-    """Positions of a rig's ERAs."""
-
-    name: str
-    places: tuple[RelativePlace, ...]
-
-    def positions(self, plate: Plate) -> FloatArray:
-        """Positions on a plate [m], (eras, 2)."""
-        return np.array(self.places) * [plate.length, plate.width]
-
-
-FOUR_ERA_LAYOUTS = (
-    EraLayout("corners", ((0, 0), (1, 0), (1, 1), (0, 1))),
-    EraLayout("mid-edges", ((1 / 2, 0), (1, 1 / 2), (1 / 2, 1), (0, 1 / 2))),
-    EraLayout("long edges", ((1 / 4, 0), (3 / 4, 0), (3 / 4, 1), (1 / 4, 1))),
-    EraLayout("short edges", ((0, 1 / 4), (1, 1 / 4), (1, 3 / 4), (0, 3 / 4))),
-    EraLayout("inset corners", ((1 / 6, 1 / 6), (5 / 6, 1 / 6), (5 / 6, 5 / 6), (1 / 6, 5 / 6))),
-    EraLayout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
-    EraLayout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
-)
-"""Layouts of four ERAs; the first one is from the paper's Table 2."""
-
-_OTHERS = (
-    EraLayout("centre", ((1 / 2, 1 / 2),)),
-    EraLayout("opposite corners", ((0, 0), (1, 1))),
-    EraLayout("mid-short-edges", ((0, 1 / 2), (1, 1 / 2))),
-    EraLayout("triangle", ((0, 0), (1, 0), (1 / 2, 1))),
-    EraLayout("corners and center", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
-    EraLayout(
-        "corners and mid-long-edges", ((0, 0), (1 / 2, 0), (1, 0), (1, 1), (1 / 2, 1), (0, 1))
-    ),
-)
-
-
-def named_layouts(era_count: int) -> tuple[EraLayout, ...]:
-    """Return the named layouts for a number of ERAs."""
-    layouts = (*FOUR_ERA_LAYOUTS, *_OTHERS)
-    return tuple(layout for layout in layouts if len(layout.places) == era_count)
-
-
-def alike(era: OneKind, positions: FloatArray) -> tuple[OneKind, ...]:
-    """Return copies of an ERA at positions [m] (n, 2), named E1, E2, ..."""
-    return tuple(
-        replace(era, name=f"E{number}", x=float(x), y=float(y))
-        for number, (x, y) in enumerate(positions, start=1)
-    )

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +18,7 @@ from pydantic_core import to_jsonable_python
 from model.config.document import (
     Document,
     KeyPath,
+    Value,
     data_text,
     key_name,
     parse_document,
@@ -28,20 +30,33 @@ from model.errors import InputError, expect_instance, expect_path
 from model.files.array_file import whole_or_nothing
 from model.files.output_paths import check_ending
 from model.rig.actuator_keys import ACTUATOR_KINDS
+from model.rig.plate_sections import PlateSection
 from model.rig.rig import Rig
-from model.rig.rig_file import (
-    base_fingerprint,
-    base_path,
-    merged_keys,
-    own_keys,
-    rig_of,
-)
-from model.rig.sections import PlateSection, RigSection
+from model.rig.rig_file import base_fingerprint, base_path, merged_keys, own_keys, rig_of
+from model.rig.sections import RigSection
+from model.structure.attachments import PointLoad
 from model.structure.material import known_material
 from model.structure.modal_elasticity import check_is_plate
 from model.structure.plate import FIELDS_BESIDE_THEORY
 
-_SAME, _NONE = 1e-9, 1e-12  # relative; and below it, a value of any quantity counts as zero
+_TOLERANCE = 1e-9  # of written numbers, relative
+
+_ZERO = 1e-12  # a smaller value of any quantity counts as zero
+
+_SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
+"""Keys that are changed as a whole."""
+
+_CHANGED = "change_rig"
+"""Document name in errors."""
+
+_POSITIONED = {"eras", "masses", "supports"}
+"""Sections whose entries have a position on the plate."""
+
+_THEORY_KEYS = PlateSection.model_fields.keys() - {*FIELDS_BESIDE_THEORY, "modes"}
+"""Keys of a plate that determine the theoretical modes to which its `modes` are relative."""
+
+_REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")
+"""Fields of a rig that the text of a fitted one contains."""
 
 
 def save_beside(
@@ -61,16 +76,21 @@ def save_beside(
     file, and contains the complete rig. Returns the rig as read back. Raises InputError, before
     writing, if that differs from the expected one; OSError if the file cannot be written.
     """
-    over = document.over
-    base = Path(document.source) if over is None else base_path(over)
-    name = _beside(output, base)
+    fitted_file = document.over
+    if fitted_file is None:
+        base, former_keys = Path(document.source), {}
+    else:
+        base, former_keys = base_path(fitted_file), own_keys(fitted_file)
+    name = _name_below(output, base)
     if name is None:
         data = merged_keys(document.data, {**keys})
     else:
-        own = {} if over is None else own_keys(over)
-        known = base_fingerprint(document) if over is None else over.data["base_fingerprint"]
-        changed = merged_keys(own, {**keys}, is_final=False)
-        data = {"base": name, "base_fingerprint": known, **changed}
+        if fitted_file is None:
+            fingerprint: Value = base_fingerprint(document)
+        else:
+            fingerprint = fitted_file.data["base_fingerprint"]
+        changes = merged_keys(former_keys, {**keys}, is_final=False)
+        data = {"base": name, "base_fingerprint": fingerprint, **changes}
         if errors:
             rounded = {path: float(f"{error:.3g}") for path, error in errors.items()}
             data["standard_errors"] = _nested(rounded)
@@ -113,31 +133,45 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
     A key to be removed is None.
     """
     document = _document_of(before)
-    section, data = Validation(document, RigSection).finish(), cast("dict[str, Any]", document.data)
-    own = _values(before, section)
-    restated = {("plate", "loss_factor")} | {
-        ("eras", era.name, key) for era in after.eras for key in ACTUATOR_KINDS[type(era)].instead
-    }
-    found = {
-        path: value
-        for path, value in _values(after, section).items()
-        if value != own[path] or path in restated
-    }
-    for path, value in found.items():
+    section = Validation(document, RigSection).finish()
+    data = cast("dict[str, Any]", document.data)
+    changes = _changed_values(before, after, section)
+    for path, value in changes.items():
         if path[-1] == "material":
-            found[path] = _restated_material(data, path, value)
-    keys = _nested(found, data)
+            changes[path] = _restated_material(data, path, value)
+    keys = _nested(changes, data)
     for era in after.eras:
-        entry, stated_keys = keys["eras"][era.name], data["eras"][era.name]
-        for key, others in ACTUATOR_KINDS[type(era)].instead.items():
+        entry, base_keys = keys["eras"][era.name], data["eras"][era.name]
+        for key, replaced_keys in ACTUATOR_KINDS[type(era)].instead.items():
             if key in entry:
-                entry |= dict.fromkeys(other for other in others if other in stated_keys)
-    names = {*(data.get("masses") or ())}
-    for mass in after.masses[len(before.masses) :]:
-        name = next(each for n in range(1, len(names) + 2) if (each := f"found{n}") not in names)
-        names.add(name)
-        keys.setdefault("masses", {})[name] = {"at": [mass.x, mass.y], "mass": mass.mass}
+                entry |= {replaced: None for replaced in replaced_keys if replaced in base_keys}
+    _add_masses(keys, data, after.masses[len(before.masses) :])
     return keys
+
+
+def _changed_values(before: Rig, after: Rig, section: RigSection) -> dict[KeyPath, Any]:
+    """Return the values that differ between two rigs, and those that replace other keys."""
+    always: set[KeyPath] = {("plate", "loss_factor")}
+    for era in after.eras:
+        always |= {("eras", era.name, key) for key in ACTUATOR_KINDS[type(era)].instead}
+    former = _values(before, section)
+    changes = {}
+    for path, value in _values(after, section).items():
+        if value != former[path] or path in always:
+            changes[path] = value
+    return changes
+
+
+def _add_masses(keys: dict[str, Any], data: Mapping[str, Any], masses: Sequence[PointLoad]) -> None:
+    """Add identified masses to rig-file keys, as found1, found2, ..."""
+    names = {*(data.get("masses") or ())}
+    for mass in masses:
+        number = 1
+        while f"found{number}" in names:
+            number += 1
+        names.add(f"found{number}")
+        entry = {"at": [mass.x, mass.y], "mass": mass.mass}
+        keys.setdefault("masses", {})[f"found{number}"] = entry
 
 
 def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
@@ -152,14 +186,17 @@ def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
             "`era rig identify` write one"
         )
     base = rig_of(read_document(base_path(document.over)))
-    own = dict(_leaves(_nested(_values(base, Validation(_document_of(base), RigSection).finish()))))
-    written = dict(_leaves(_document_of(base).data)) | own
+    base_document = _document_of(base)
+    section = Validation(base_document, RigSection).finish()
+    base_values = dict(_leaves(base_document.data))
+    base_values |= _leaves(_nested(_values(base, section)))
     errors = dict(_leaves(document.over.data.get("standard_errors") or {}))
-    return [
-        (key_name(path), written.get(path), value, errors.get(path))
-        for path, value in _leaves(own_keys(document.over))
-        if value != written.get(path)
-    ]
+    rows = []
+    for path, value in _leaves(own_keys(document.over)):
+        base_value = base_values.get(path)
+        if value != base_value:
+            rows.append((key_name(path), base_value, value, errors.get(path)))
+    return rows
 
 
 def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
@@ -167,15 +204,17 @@ def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
     if not isinstance(value, Mapping):
         yield path, value
         return
-    for key, each in value.items():
-        yield from _leaves(each, (*path, key))
+    for key, entry in value.items():
+        yield from _leaves(entry, (*path, key))
 
 
-def _beside(output: Path, base: Path) -> str | None:
-    """Return the relative name of a file in another one's folder or below it; None elsewhere."""
+def _name_below(output: Path, base: Path) -> str | None:
+    """Return the name of a base relative to the output's folder; None for a base outside of it."""
     folder = output.absolute().parent
-    place = base.absolute()
-    return place.relative_to(folder).as_posix() if place.is_relative_to(folder) else None
+    base_file = base.absolute()
+    if not base_file.is_relative_to(folder):
+        return None
+    return base_file.relative_to(folder).as_posix()
 
 
 def _document_of(rig: Rig) -> Document:
@@ -187,18 +226,22 @@ def _document_of(rig: Rig) -> Document:
 
 def _nested(values: Mapping[KeyPath, Any], data: Any = None) -> dict[str, Any]:
     """Convert values by path to nested mappings; lists along a path are copied from the data."""
-    found: dict[str, Any] = {}
+    nested: dict[str, Any] = {}
     for path, value in values.items():
-        at: Any = found
-        own = data
+        parent: Any = nested
+        original = data
         for part in path[:-1]:
-            own = own.get(part) if isinstance(own, Mapping) else own and own[part]
-            if isinstance(at, dict):
-                at = at.setdefault(part, deepcopy(own) if isinstance(own, list) else {})
+            if isinstance(original, Mapping):
+                original = original.get(part)
+            elif original:
+                original = original[part]
+            if isinstance(parent, dict):
+                empty = deepcopy(original) if isinstance(original, list) else {}
+                parent = parent.setdefault(part, empty)
             else:
-                at = at[part]
-        at[path[-1]] = value
-    return found
+                parent = parent[part]
+        parent[path[-1]] = value
+    return nested
 
 
 def _restated_material(data: Any, path: KeyPath, value: dict[str, Any]) -> dict[str, Any]:
@@ -209,64 +252,55 @@ def _restated_material(data: Any, path: KeyPath, value: dict[str, Any]) -> dict[
     if isinstance(data, Mapping):
         return {**data, **value}
     by_frequency = known_material(data).by_frequency
-    return value | ({"by_frequency": [*map(list, by_frequency)]} if by_frequency else {})
+    if not by_frequency:
+        return value
+    return value | {"by_frequency": [list(row) for row in by_frequency]}
 
 
 def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
     """Return the values of a rig that a fit can change, by key path, as the file states them."""
-    found: dict[KeyPath, Any] = {
-        ("uncertainty", key): value for key, value in asdict(rig.uncertainty).items()
-    }
+    values: dict[KeyPath, Any] = {}
+    for key, value in asdict(rig.uncertainty).items():
+        values["uncertainty", key] = value
     if section.plate is not None:
-        of_plate = section.plate.stated(rig.plate, rig.laminate)
-        found |= {("plate", *path): value for path, value in of_plate.items()}
+        for path, value in section.plate.keys_of(rig.plate, rig.laminate).items():
+            values["plate", *path] = value
     for era in rig.eras:
-        of_era = ACTUATOR_KINDS[type(era)].stated(era)
-        found |= {("eras", era.name, key): value for key, value in of_era.items()}
+        for key, value in ACTUATOR_KINDS[type(era)].keys_of(era).items():
+            values["eras", era.name, key] = value
     for name, number in zip(rig.foot_names, rig.feet, strict=True):
-        found["supports", name, "stiffness"] = rig.masses[number].stiffness
-    return found
+        values["supports", name, "stiffness"] = rig.masses[number].stiffness
+    return values
 
 
-def _is_same(one: Rig, other: Rig, section: RigSection) -> bool:
+def _is_same(rig: Rig, expected: Rig, section: RigSection) -> bool:
     """Return whether all written numbers of two rigs agree within rounding of logarithms."""
-    here, there = ([*_numbers(each, section)] for each in (one, other))
-    return len(here) == len(there) and all(
-        math.isclose(a, b, rel_tol=_SAME, abs_tol=_NONE) for a, b in zip(here, there, strict=True)
-    )
+    numbers, expected_numbers = _numbers(rig, section), _numbers(expected, section)
+    if len(numbers) != len(expected_numbers):
+        return False
+    is_close = partial(math.isclose, rel_tol=_TOLERANCE, abs_tol=_ZERO)
+    return all(map(is_close, numbers, expected_numbers))
 
 
-def _numbers(rig: Rig, section: RigSection) -> Iterator[float]:
-    """Yield all written numbers of a rig."""
+def _numbers(rig: Rig, section: RigSection) -> list[float]:
+    """Return all written numbers of a rig."""
     # A file's own masses come before its supports, identified ones after both.
-    masses = sorted(
-        rig.masses, key=lambda each: (each.stiffness > 0, round(each.x, 5), round(each.y, 5))
-    )
-    parts: list[Any] = [_values(rig, section), [(each.x, each.y, each.mass) for each in masses]]
+    masses = sorted(rig.masses, key=_order_of_load)
+    numbers: list[float] = []
+    parts: list[Any] = [_values(rig, section), [(mass.x, mass.y, mass.mass) for mass in masses]]
     while parts:
         match parts.pop():
             case int() | float() as number:
-                yield number
-            case Mapping() as values:
-                parts += values.values()
-            case list() | tuple() as values:
-                parts += values
+                numbers.append(number)
+            case Mapping() as mapping:
+                parts += mapping.values()
+            case list() | tuple() as sequence:
+                parts += sequence
+    return numbers
 
 
-_SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
-"""Keys that are changed as a whole."""
-
-_CHANGED = "change_rig"
-"""Document name in errors."""
-
-_PLACED = {"eras", "masses", "supports"}
-"""Sections whose entries have a position on the plate."""
-
-_OF_THEORY = PlateSection.model_fields.keys() - {*FIELDS_BESIDE_THEORY, "modes"}
-"""Keys of a plate that determine the theoretical modes to which its `modes` are relative."""
-
-_REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")
-"""Fields of a rig that the text of a fitted one contains."""
+def _order_of_load(load: PointLoad) -> tuple[bool, float, float]:
+    return load.stiffness > 0, round(load.x, 5), round(load.y, 5)
 
 
 def checked_keys(source: str, section: type[Section], keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -309,8 +343,8 @@ def rig(
             eras, Mapping, what="eras", made_by='{"SW": era.Era(at=(0, 0), stiffness=17e3)}'
         )
         amplifiers = {"main": {"url": "sim://"}}
-        wired = {name: {"amplifier": "main", "channel": n} for n, name in enumerate(eras)}
-        eras = _merged(wired, eras)
+        wiring = {name: {"amplifier": "main", "channel": n} for n, name in enumerate(eras)}
+        eras = _merged(wiring, eras)
     sections = {
         "plate": plate,
         "eras": eras,
@@ -339,17 +373,18 @@ def save_rig(rig: Rig, path: Path | str) -> None:
         True
     """
     expect_instance(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
-    place, document = expect_path(path, what="path"), stated(rig)
-    if (over := document.over) is not None:
-        for file in (Path(over.source), base_path(over)):
-            if place.resolve() == file.resolve():
+    file = expect_path(path, what="path")
+    document = document_for(rig)
+    if document.over is not None:
+        for source in (Path(document.over.source), base_path(document.over)):
+            if file.resolve() == source.resolve():
                 raise InputError(
-                    f"path must be another file than {file}, which this fitted rig was read from"
+                    f"path must be another file than {source}, which this fitted rig was read from"
                 )
-    check_ending(place, ".yaml", ".yml", what="a rig file")
-    written = parse_document(str(place), document.whole_text)
+    check_ending(file, ".yaml", ".yml", what="a rig file")
+    written = parse_document(str(file), document.whole_text)
     rig_of(written)
-    with whole_or_nothing(place) as stream:
+    with whole_or_nothing(file) as stream:
         stream.write(written.text.encode())
 
 
@@ -373,35 +408,35 @@ def change_rig(rig: Rig, **changes: Any) -> Rig:
             expect_instance(
                 changes[key], Mapping, what=key, made_by='{"thickness": 0.002} or era.Era'
             )
-    data: dict[str, Any] = {**stated(rig).data}
+    data: dict[str, Any] = {**document_for(rig).data}
     plate_changes = {
         key: value for key, value in changes.items() if key not in RigSection.model_fields
     }
     plate_changes |= changes.get("plate", {})
-    data["plate"] = _given({**data["plate"], **plate_changes})
-    changes_modes = not _OF_THEORY.isdisjoint(plate_changes)
+    data["plate"] = _without_none(data["plate"] | plate_changes)
+    changes_modes = not _THEORY_KEYS.isdisjoint(plate_changes)
     if data["plate"].get("modes") and changes_modes and "modes" not in plate_changes:
         raise InputError(
             f"{_CHANGED}: plate.modes must be given for another plate, got those identified on "
             "this one; use modes=None for theoretical modes"
         )
-    sections = _with_shares_kept(rig, data)
+    sections = _with_relative_positions(rig, data)
     for key in _SECTIONS & changes.keys():
         sections[key] = changes[key]
     sections["eras"] = _merged(sections["eras"], changes.get("eras", {}))
     return rig_of(_document(_CHANGED, sections))
 
 
-def _with_shares_kept(rig: Rig, data: Mapping[str, Any]) -> dict[str, Any]:
+def _with_relative_positions(rig: Rig, data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the sections of a rig of another size, with relative positions unchanged."""
-    read = Validation(_document(_CHANGED, data), RigSection).field
-    length = read(("plate", "length"), PlateSection) or rig.plate.length
-    width = read(("plate", "width"), PlateSection) or rig.plate.width
+    validation = Validation(_document(_CHANGED, data), RigSection)
+    length = validation.field(("plate", "length"), PlateSection) or rig.plate.length
+    width = validation.field(("plate", "width"), PlateSection) or rig.plate.width
     factors = (length / rig.plate.length, width / rig.plate.width)
     sections = {**data}
     if factors == (1, 1):
         return sections
-    for kind in _PLACED & data.keys():
+    for kind in _POSITIONED & data.keys():
         sections[kind] = {name: _moved(keys, factors) for name, keys in data[kind].items()}
     return sections
 
@@ -417,19 +452,17 @@ def _moved(keys: Mapping[str, Any], factors: tuple[float, float]) -> Mapping[str
     return {**keys, "at": position}
 
 
-def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(sections: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Merge changes into sections: keys are changed or added; None removes keys or whole
     sections."""
-    sections = {**own, **changes}
-    return _given(
-        {
-            name: _given({**own.get(name, {}), **each}) if isinstance(each, Mapping) else each
-            for name, each in sections.items()
-        }
-    )
+    merged = {**sections, **changes}
+    for name, keys in merged.items():
+        if isinstance(keys, Mapping):
+            merged[name] = _without_none({**sections.get(name, {}), **keys})
+    return _without_none(merged)
 
 
-def stated(rig: Rig) -> Document:
+def document_for(rig: Rig) -> Document:
     """Return a document that expresses a rig; raises InputError for one not built from keys.
 
     For a fitted rig it contains plate, ERAs, masses and uncertainty.
@@ -439,29 +472,28 @@ def stated(rig: Rig) -> Document:
     if before == rig:
         return document
     data = merged_keys(document.data, fitted_keys(before, rig))
-    found = Document(document.source, "", data)
-    back = rig_of(found)
-    is_same = _is_same(back, rig, Validation(document, RigSection).finish())
-    if not is_same or replace(back, **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
+    fitted_document = Document(document.source, "", data)
+    fitted = rig_of(fitted_document)
+    is_same = _is_same(fitted, rig, Validation(document, RigSection).finish())
+    rewritten = {name: getattr(rig, name) for name in _REWRITTEN}
+    if not is_same or replace(fitted, **rewritten) != rig:
         raise InputError(
             "rig must differ from its keys only in plate, ERAs, masses and uncertainty; change "
             "others by change_rig"
         )
-    return found
+    return fitted_document
 
 
 def _document(source: str, keys: Mapping[str, Any]) -> Document:
     """Return keys given by a program as file data."""
-    return Document(
-        source,
-        "",
-        to_jsonable_python(
-            _given(keys),
-            fallback=lambda each: each.tolist() if hasattr(each, "tolist") else repr(each),
-        ),
-    )
+    return Document(source, "", to_jsonable_python(_without_none(keys), fallback=_as_list_or_text))
 
 
-def _given(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys that are not left out."""
+def _as_list_or_text(value: Any) -> Any:
+    """Convert an array to a list, and any other object to text."""
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
+
+
+def _without_none(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys whose value is not None."""
     return {key: value for key, value in keys.items() if value is not None}

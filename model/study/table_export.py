@@ -19,15 +19,14 @@ from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
 from model.rig.actuator_keys import ACTUATOR_KINDS
-from model.rig.rig import PHYSICS
-from model.rig.sections import (
+from model.rig.plate_sections import (
     AirGapSection,
-    FingertipSection,
     LayerSection,
-    MassSection,
     MaterialSection,
     PlateSection,
 )
+from model.rig.rig import PHYSICS
+from model.rig.sections import FingertipSection, MassSection
 from model.study.weak_cells import pair_questions
 from model.table.table import LocalizationTable
 from model.table.table_file import FORMAT_VERSION

@@ -36,7 +36,7 @@ from model.processes import Progress, on_processes, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json, differences
-from model.rig.rig_file import parse_mesh
+from model.rig.rig_mesh import parse_mesh
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import check_supported, footprints_of
 from model.structure.modal_elasticity import Dispersion, check_scales

@@ -18,7 +18,7 @@ from model.answer.stimulus import Finger
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.spectral.modes import PlateMesh
 from model.structure.attachments import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.exciter import Actuator

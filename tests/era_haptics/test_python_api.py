@@ -449,7 +449,7 @@ def test_command_draws_into_files_whatever_backend_is_named(backend: str) -> Non
     """That of a notebook, none, or one that matplotlib has no more; children inherit `agg`."""
     program = (
         "import os, sys; sys.argv[1:] = ['--version']; from era_haptics.command import main; "
-        "main(); import model.figures; print(os.environ['MPLBACKEND'])"
+        "main(); import model.figures.style; print(os.environ['MPLBACKEND'])"
     )
     done = ran(program, MPLBACKEND=backend)
     assert (done.returncode, done.stderr) == (0, "")

@@ -29,7 +29,7 @@ from model.errors import InputError
 from model.estimate import calibrate
 from model.files.array_file import UNREADABLE, read_arrays
 from model.processes import on_cluster
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.structure.material import material
 from model.structure.plate import Plate
 from processes.error_cases import (
@@ -121,7 +121,7 @@ QUICK = [
 """Those that `make test` lets write to a full disk: all replace files in the same way."""
 
 LONG = {
-    "table plot table.npz -o plots": "model.figures.table_figures",
+    "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
     "table show table.npz": "model.study.overview.find_overview",
     "table verify table.npz rig.yaml": "model.study.verification.verify_table",
     "plate convergence rig.yaml": "model.vibration.study_convergence",

@@ -14,7 +14,8 @@ from tables import stiffness_study, tables
 
 from era_haptics.command import run_era
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
-from model.figures import answer_figure, levels_figure
+from model.figures.answers import answer_figure
+from model.figures.table_pictures import levels_figure
 from model.rig.rig_file import load_rig
 
 POINT = 25.4 / 72  # mm

@@ -29,7 +29,7 @@ from model.finger import (
     sensation_level,
     sensitivities,
 )
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.vibration import (

@@ -18,7 +18,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig_file import mesh_of
+from model.rig.rig_mesh import mesh_of
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Era
 from model.structure.material import Material

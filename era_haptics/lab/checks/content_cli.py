@@ -381,7 +381,7 @@ def _check_one(file: Path, setting: _Setting, picture: Path | None, *, as_json: 
     pictures = []
     if picture is not None:
         from era_haptics.lab.checks.content_check import content_figure
-        from model.figures import save_figure
+        from model.figures.style import save_figure
 
         save_figure(content_figure(pattern, checked), picture)
         pictures = [str(picture)]

@@ -59,7 +59,7 @@ def check(
     files = []
     if picture is not None:
         from era_haptics.lab.checks.layout_picture import check_figure
-        from model.figures import save_figure
+        from model.figures.style import save_figure
 
         save_figure(check_figure(layout, table, checked, together), picture)
         files = [str(picture)]

@@ -30,7 +30,7 @@ from era_haptics.lab.checks.layout_check import (
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB, Answer
 from model.answer.plan import answer
 from model.arrays import FloatArray, Point, best_of
-from model.figures import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, draw_eras, label_plate
+from model.figures.style import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, draw_eras, label_plate
 from model.processes import Progress, unseen
 from model.quantities import counted
 from model.table.table import LocalizationTable

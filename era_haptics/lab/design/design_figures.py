@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from era_haptics.lab.design.results import Design
 from model.arrays import FloatArray
-from model.figures import COLORS, PAGE_WIDTH, SMALL_TEXT, draw_eras, label_plate
+from model.figures.style import COLORS, PAGE_WIDTH, SMALL_TEXT, draw_eras, label_plate
 from model.quantities import counted
 
 _COUNT_STYLES = (("--", "s"), ("-.", "^"), (":", "D"))  # line and marker

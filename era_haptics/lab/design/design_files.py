@@ -10,7 +10,8 @@ from era_haptics.lab.design.layout_keys import layout_keys
 from era_haptics.lab.design.problem import DesignProblem
 from era_haptics.lab.design.results import Design, RankedLayout
 from model.config.document import Value, data_text
-from model.figures import Template, save_figure, write_template
+from model.figures.style import save_figure
+from model.figures.template import Template, write_template
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_columns
 from model.quantities import counted

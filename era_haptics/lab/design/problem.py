@@ -34,8 +34,9 @@ from model.config.fields import (
 )
 from model.config.units import LENGTH
 from model.errors import InputError
-from model.rig.actuator_keys import Identifier
-from model.rig.rig import Rig, named_layouts
+from model.rig.era_layouts import named_layouts
+from model.rig.key_types import Identifier
+from model.rig.rig import Rig
 from model.structure.attachments import rigid_body_frequencies, static_loads
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate

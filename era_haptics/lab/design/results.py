@@ -12,7 +12,7 @@ from model.config.document import Document
 from model.finger import STRONG_DB_SL
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
-from model.rig.rig_writing import stated
+from model.rig.rig_writing import document_for
 from model.structure.exciter import Actuator
 
 _LEVEL_MARGIN = 0.1  # dB
@@ -116,7 +116,7 @@ class RankedLayout:
     @property
     def rig(self) -> Rig:
         """The rig with these ERAs on free channels, if necessary on a new, simulated amplifier."""
-        rig_data = stated(self.problem.rig).data
+        rig_data = document_for(self.problem.rig).data
         keys = layout_keys(self.problem, self.found.positions, rig_data)
         return rig_of(Document("RankedLayout.rig", "", keys))
 

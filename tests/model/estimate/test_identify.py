@@ -39,8 +39,9 @@ from model.estimate.space import inwards, rig_with, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig, mesh_of, rig_of
-from model.rig.rig_writing import save_fitted, stated
+from model.rig.rig_file import example_rig_path, load_rig, rig_of
+from model.rig.rig_mesh import mesh_of
+from model.rig.rig_writing import document_for, save_fitted
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import PointLoad
@@ -350,7 +351,7 @@ def test_moduli_along_across_and_of_shear_are_found() -> None:
         before = own.moduli[key] * rig.plate.thickness**3
         assert rigidity / before == pytest.approx(factor, rel=0.03)
     assert any("E2" in row for row in fit_rows(found))
-    back = rig_of(stated(found.rig))
+    back = rig_of(document_for(found.rig))
     assert back.plate.material.moduli == pytest.approx(known.material.moduli, rel=1e-5)
 
 
@@ -531,7 +532,7 @@ def test_identified_board_has_the_parts_that_it_was_built_of() -> None:
     places = np.vstack([places, [[0.24, 0.2]]])
     found = identify(rig, measured(built, np.linspace(42.0, 298.0, 13), places))
     assert found.is_explained
-    again = rig_of(stated(found.rig))
+    again = rig_of(document_for(found.rig))
     forces = []
     for true, after in zip(built.eras, again.eras, strict=True):
         assert isinstance(true, Exciter)

@@ -25,9 +25,11 @@ from model.errors import InputError
 from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig import rig_writing
-from model.rig.rig import FOUR_ERA_LAYOUTS, Channel, Rig, Uncertainty
-from model.rig.rig_file import load_rig, parse_mesh, parse_rig
-from model.rig.rig_summary import gain_notes
+from model.rig.era_layouts import FOUR_ERA_LAYOUTS
+from model.rig.rig import Channel, Rig, Uncertainty
+from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig_mesh import parse_mesh
+from model.rig.rig_warnings import gain_notes
 from model.rig.rig_writing import (
     fitted_keys,
     save_beside,

@@ -20,15 +20,16 @@ from cases import shortly
 from controller.rig_file_check import RIG
 from key_tables import quantities
 from kit.plates import exciter_rig, exciter_rig_text
-from model.commands.plate_cli import show
+from model.commands.plate_show_cli import show
 from model.config.document import ConfigError, data_text, parse_document
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
+from model.rig.plate_sections import PLAIN_KEYS, PlateSection
 from model.rig.rig import Rig, Uncertainty, differences
 from model.rig.rig_file import example_rig_path, parse_rig, rig_of
-from model.rig.rig_summary import exciter_notes, plate_summary, resonance_notes
-from model.rig.rig_writing import stated as keys_of
-from model.rig.sections import PLAIN_KEYS, PlateSection
+from model.rig.rig_summary import plate_summary
+from model.rig.rig_warnings import exciter_notes, resonance_notes
+from model.rig.rig_writing import document_for as keys_of
 from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
 from model.structure.material import EXCITER_TYPES, Material

@@ -36,7 +36,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.rig.rig_file import parse_mesh
+from model.rig.rig_mesh import parse_mesh
 from model.structure.attachments import Era, FingertipLoad, fingertip_loads, footprints_of
 from model.structure.plate import Plate
 

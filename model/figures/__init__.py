@@ -1,0 +1,1 @@
+"""Pictures of plates, tables, contents, calibrations and templates, drawn with matplotlib."""

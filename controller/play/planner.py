@@ -13,17 +13,16 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from functools import partial
 
-from controller.play.changes import ChangeTimes, WaitingChanges
 from controller.play.chooser import Chooser
 from controller.play.counted_clocks import CountedClocks
-from controller.play.intent import IntentSource, Pulse, Selection, no_layer_free
+from controller.play.intent import Content, IntentSource, Pulse, Selection, no_layer_free
 from controller.play.layer_sets import Sets
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slot import Slot
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Slots
 from controller.sources.contact_tracker import ContactTracker
-from controller.sources.touch import Contact
+from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
 from drivers.protocol.definition import HEARTBEAT
@@ -41,6 +40,9 @@ ENDED = (
 )
 
 _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; longest time without counting clocks while fingers change
+
+ChangeTimes = Mapping[ContactKey | None, float]
+"""When [s] fingers changed, by contact; the key None is for the first finger that lifted."""
 
 _logger = logging.getLogger(__name__)
 
@@ -125,7 +127,6 @@ class Planner:
         self._last_selection: Selection | None = None  # including contents that limits left out
         self._planned_contacts: Sequence[Contact] = ()
         self._unstarted_pulses: dict[int, Pulse] = {}  # planned, but not started; by identity
-        self._changes = WaitingChanges(tracker)
 
     @property
     def due(self) -> float:
@@ -164,9 +165,8 @@ class Planner:
             return self._prolonged(last_plan, now)
         selected = self._select(now)
         if last_plan is not None and self._is_planned(selected, now):
-            self._changes.answered_by((), self._selector.pending)
+            self._take_changes((), now)
             return self._prolonged(last_plan, now)
-        self._changes.wait_again_after_refusal()
         self.slots.keep_ended(selected.contents)
         playable = self._playable(selected)
         if not playable.contents:
@@ -216,13 +216,32 @@ class Planner:
         for content in started:
             for pulse in content.pulses:
                 self._unstarted_pulses[id(pulse)] = pulse
-        answered = self._changes.answered_by(started, self._selector.pending)
+        answered = self._take_changes(started, now)
         contacts = self._tracker.contacts
         plan = Plan(contacts, playable, now, answered, sets, former_slots=former_slots)
         self._last_plan = plan
         self._last_selection = selected
         self._retry_at = sets.retry_at
         return plan
+
+    def _take_changes(self, started: Sequence[Content], now: float) -> ChangeTimes:
+        """Return the changes that a plan responds to at a time [s]; they no longer wait.
+
+        While contents are chosen in the thread, the plan responds to lifts and to the fingers whose
+        contents start. A lasting content can start while its finger moves on; then the change that
+        the thread chooses for has just come.
+        """
+        if self._selector.pending is None:
+            return self._tracker.take_changes()
+        keys: set[ContactKey | None] = {None}
+        moved = dict[ContactKey | None, float]()
+        for content in started:
+            keys.update(content.contact_keys)
+            if not content.target.is_short:
+                moved |= dict.fromkeys(content.contact_keys, now)
+        answered = self._tracker.take_changes(keys)
+        self._tracker.wait_again(moved)
+        return answered
 
     def _is_planned(self, selected: Selection, now: float) -> bool:
         """Whether the last plan is for the same selection and no refused set is due again."""
@@ -376,7 +395,6 @@ class Planner:
             self._unstarted_pulses.clear()
         retry_at = now + RETRY if refusal.until is None else refusal.until
         self._retry_at = max(retry_at, now + HEARTBEAT)
-        self._changes.refused = plan.answered
         silence = self.slots.silence(FADE_RAMP)
         self.slots.adopt(silence, now)
         sets = replace(silence, reason=str(refusal))

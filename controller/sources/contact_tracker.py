@@ -66,13 +66,16 @@ class ContactTracker:
         """Time [s] of each contact's first change not yet answered by a set; None: first lift."""
         return self._changed
 
-    def forget_changes(self) -> None:
-        """Forget all changes, which are answered."""
-        self._changed.clear()
-
-    def forget_lifts(self) -> None:
-        """Forget that contacts were lifted, which is answered."""
-        self._changed.pop(None, None)
+    def take_changes(
+        self, keys: Collection[ContactKey | None] | None = None
+    ) -> dict[ContactKey | None, float]:
+        """Return the changes of some contacts, or of all, which are answered now."""
+        if keys is None:
+            keys = self._changed.keys()
+        answered = {key: time for key, time in self._changed.items() if key in keys}
+        for key in answered:
+            del self._changed[key]
+        return answered
 
     def expiry_of(self, key: ContactKey) -> float:
         """Return the time [s] when a contact is lifted unless a frame arrives; -inf if unknown."""

@@ -340,7 +340,7 @@ def test_lifts_are_dated_by_the_newest_frame_when_their_own_has_no_time(time: fl
     tracker = ContactTracker(PLATE)
     tracker.update(frame(1.0, (1, 0.5, 0.5)))
     tracker.update(frame(1.02, (1, 0.5, 0.5), source="b"))
-    tracker.forget_changes()
+    tracker.take_changes()
     tracker.update(frame(time))
     assert tracker.changed == {None: 1.02}
 
@@ -383,7 +383,7 @@ def test_a_change_is_known_since_it_came_first_until_it_is_answered() -> None:
     tracker.update(frame(1.0, (1, 0.5, 0.5)))
     tracker.update(frame(1.1, (1, 0.6, 0.5)))
     assert tracker.changed == {key: 1.0}
-    tracker.forget_changes()
+    tracker.take_changes()
     tracker.update(frame(1.2, (1, 0.6, 0.5)))
     assert tracker.changed == {}
     tracker.update(frame(1.3, (1, 0.7, 0.5), (2, 0.1, 0.1)))

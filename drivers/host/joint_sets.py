@@ -171,7 +171,7 @@ class JointSets:
             if is_preempted is not None and is_preempted():
                 reason = Overtaken(f"set {token} is preempted")
             else:
-                reason = await self._commit(staged_sets, epoch, began)
+                reason = await self._commit(token, staged_sets, epoch, began)
         if reason is not None:
             return await self._give_up(reason, amplifiers, began)
         self.is_incomplete = False
@@ -204,16 +204,16 @@ class JointSets:
         return None
 
     async def _commit(
-        self, staged_sets: Mapping[Amplifier, StagedSet], epoch: int, began: float
+        self, token: int, staged_sets: Mapping[Amplifier, StagedSet], epoch: int, began: float
     ) -> CommandRefused | None:
-        """Commit a set on all amplifiers; return the refusal of a commit that came too late.
+        """Commit the set of a token; return the refusal of a commit that came too late.
 
         epoch, began: of the members, and the time [s], before staging. Raises any other error.
         """
         self._members.check_none_since(epoch)
         self.is_incomplete = True
         try:
-            await self._commit_on_lines(staged_sets)
+            await self._commit_on_lines(token, staged_sets)
         except CommandRefused as refusal:
             if refusal.until is None or self._members.epoch != epoch:
                 raise
@@ -257,12 +257,13 @@ class JointSets:
         await self._members.all([amplifier.silence(ramp) for amplifier in amplifiers])
         self.is_incomplete = False
 
-    async def _commit_on_lines(self, staged_sets: Mapping[Amplifier, StagedSet]) -> None:
-        """Commit on all lines for one moment, by one broadcast for amplifiers that share a line.
+    async def _commit_on_lines(
+        self, token: int, staged_sets: Mapping[Amplifier, StagedSet]
+    ) -> None:
+        """Commit a set on all lines for one moment, with one broadcast for each shared line.
 
         Raises CommandRefused if an amplifier does not play its set afterwards.
         """
-        token = self.token
         by_line: dict[Line, list[Amplifier]] = {}
         for amplifier in staged_sets:
             by_line.setdefault(amplifier.line, []).append(amplifier)

@@ -185,8 +185,9 @@ class Crossfades:
     def _in_order(self, goal: Answer, playing: _Voices, changes: _Voices) -> tuple[Selection, ...]:
         """Return the selection after each step, the best content first; empty without an order.
 
-        A content that can follow now never prevents a later one, so no other order gets further
-        than this one.
+        A content that can follow now never brings frequencies too near for a later one. It can use
+        limits of the amplifiers that a later one needs; another order might get further then, but
+        only this one is tried.
         """
         remaining = {**changes}
         steps = list[Selection]()

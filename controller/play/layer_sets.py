@@ -67,7 +67,7 @@ class Sets:
     retry_at: float = math.inf
     """When [s] the ledger may admit them."""
     preempted_until: float = math.inf
-    """When [s] a touch no longer preempts endings and pieces of courses."""
+    """When [s] an event no longer preempts endings and pieces of courses."""
 
     @cached_property
     def by_amplifier(self) -> dict[str, list[AmplifierLayer]]:

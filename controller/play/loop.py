@@ -45,8 +45,9 @@ _logger = logging.getLogger(__name__)
 class SendFailure(Enum):
     """Why the sets of a plan do not play, and what plays instead."""
 
-    PREEMPTED_BY_TOUCH = auto()
-    """A touch came before any amplifier played the sets; the former contents continue."""
+    PREEMPTED = auto()
+    """A touch or a request of a client came before any amplifier played the sets; the former
+    contents continue."""
     REFUSED = auto()
     """The amplifiers refused the sets; the former contents continue."""
     NO_REPLY = auto()
@@ -156,7 +157,7 @@ class Cycle:
             sent_at = await self._play(planner, plan.sets)
         except BaseException as error:
             failure = self._failure_of(error, plan.sets)
-            if failure is SendFailure.PREEMPTED_BY_TOUCH:
+            if failure is SendFailure.PREEMPTED:
                 return  # the endings follow the sets of the next plan
             if failure is not SendFailure.REFUSED:
                 planner.not_played(plan, is_known=failure is SendFailure.NO_REPLY)
@@ -177,7 +178,7 @@ class Cycle:
     def _failure_of(self, error: BaseException, sets: Sets) -> SendFailure:
         """Classify the exception that ended an attempt to send sets."""
         if isinstance(error, Overtaken):
-            return SendFailure.PREEMPTED_BY_TOUCH
+            return SendFailure.PREEMPTED
         if sets.silence is not None:
             return SendFailure.UNKNOWN
         is_refusal = isinstance(error, CommandRefused) and not isinstance(error, Preempted)
@@ -206,11 +207,11 @@ class Cycle:
         if self.group.sets.is_in_doubt:
             await self.group.silence(RELEASE_RAMP)  # before the next pattern
 
-        def is_preempted_by_touch() -> bool:
-            return self._wake.is_set() and threads.now() < sets.preempted_until
+        def is_preempted() -> bool:
+            has_event = self._wake.is_set()  # a touch, or a request of a client
+            return has_event and threads.now() < sets.preempted_until
 
-        is_preempted = is_preempted_by_touch if sets.updates else None
-        played = await self.group.apply(sets.by_amplifier, is_preempted)
+        played = await self.group.apply(sets.by_amplifier, is_preempted if sets.updates else None)
         planner.confirm(sets, played, now=threads.now())
         return played.starts_at
 
@@ -324,8 +325,8 @@ class Cycle:
             until = min(until, self.planner.due)
         if self.group.is_armed:
             until = min(until, self._heartbeat_due, self.group.members.lost_from)
-            if self.planner is not None and now < self.planner.slots.update_due:
-                until = min(until, self.planner.slots.update_due)
+            if self.planner is not None:
+                until = min(until, self.planner.slots.next_update_after(now))
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

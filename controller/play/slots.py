@@ -82,10 +82,15 @@ class Slots:
         """When [s] the next event of a slot is due."""
         return min([slot.due for slot in self.by_layer.values()], default=math.inf)
 
-    @property
-    def update_due(self) -> float:
-        """When [s] the next content gets its ending, the next piece of its course, or its fall."""
-        return min([slot.update_due for slot in self.by_layer.values()], default=math.inf)
+    def next_update_after(self, now: float) -> float:
+        """Return when [s] the next ending, piece of a course or fall is due; infinite for never.
+
+        An update that is overdue at a time [s] could not be sent in this cycle, such as a piece
+        whose fingers are no longer confirmed. The loop does not wake for it, but tries it again in
+        its next cycle.
+        """
+        update_due = min([slot.update_due for slot in self.by_layer.values()], default=math.inf)
+        return update_due if update_due > now else math.inf
 
     def plan(self, contents: Sequence[Content], now: float) -> Sets:
         """Return the sets that let layers play only these contents from a time [s] on.

@@ -139,6 +139,10 @@ class _Wanted:
             return HapticIntent(tuple(targets))
         return HapticIntent((*targets, self.click), until=pulse.end)
 
+    def has_effect_at(self, contact: Any) -> bool:
+        """Whether a contact that comes down here has a target."""
+        return contact.key.id in self.targets
+
 
 @cache
 def _timing(number: int) -> Timing:

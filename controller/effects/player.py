@@ -132,6 +132,11 @@ class EffectPlayer:
             gains_db=self._gains_db(felt_plays, targets),
         )
 
+    def has_effect_at(self, contact: Contact) -> bool:
+        """Whether a contact that comes down here starts an effect."""
+        region = self.layout.region_at(contact.x, contact.y)
+        return any(self._entry_effects(region))
+
     def _start_of(self, target: Target, now: float) -> float:
         """Return when [s] a target starts to play; infinite for never."""
         if target.pulse is None or not target.is_short:
@@ -276,12 +281,18 @@ class EffectPlayer:
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
         """Start the effects of the region that a finger enters, or the effect outside all."""
-        region = finger.region
-        # The motion effect starts first, so that the newer press effect is felt before it.
-        names = (region.on_move, region.on_press) if region else (self.layout.elsewhere,)
-        for name in names:
-            if name is not None:
-                self._start(finger, region, name, contact, now)
+        for name in self._entry_effects(finger.region):
+            self._start(finger, finger.region, name, contact, now)
+
+    def _entry_effects(self, region: Region | None) -> list[str]:
+        """Return the names of the effects that start in a region, or outside all, in order.
+
+        The motion effect starts first, so that the newer press effect is felt before it.
+        """
+        names = [self.layout.elsewhere]
+        if region is not None:
+            names = [region.on_move, region.on_press]
+        return [name for name in names if name is not None]
 
     def _start(
         self, finger: _Finger, region: Region | None, name: str, contact: Contact, now: float

@@ -168,6 +168,9 @@ class IntentSource(Protocol):
         All channels are silent while it raises.
         """
 
+    def has_effect_at(self, contact: Contact) -> bool:
+        """Whether a contact that comes down here starts an effect."""
+
 
 def band_of_table(band: Band, frequencies: FloatArray) -> Band:
     """Return a band [Hz] with frequencies of a table: the band itself, or the nearest frequency."""

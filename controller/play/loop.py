@@ -284,9 +284,9 @@ class Cycle:
         planner = self.planner
         self._wake.set()
         if change.up and planner is not None:  # else the amplifiers were never open
-            planner.count_unplanned_lifts(change.up)
             if planner.is_silence_pending:
                 self.group.abort_exchange()
+            planner.count_unplanned_lifts(change.up)
         _report(self.observers.contacts_changed, self.tracker.contacts, change)
 
     def _schedule_expiry(self) -> None:

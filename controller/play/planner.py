@@ -313,11 +313,16 @@ class Planner:
         return selection.without(skipped, no_layer_free(layer_count))
 
     def count_unplanned_lifts(self, lifted: Sequence[Contact]) -> None:
-        """Count the contacts that have lifted before any plan included them, as too late."""
+        """Count the lifted contacts that no plan included although they had an effect."""
         planned_keys = {contact.key for contact in self._planned_contacts}
-        unplanned = [contact for contact in lifted if contact.key not in planned_keys]
-        if unplanned:
-            self._count_too_late(len(unplanned))
+        count = 0
+        for contact in lifted:
+            is_planned = contact.key in planned_keys
+            is_finger = contact.why_load_alone is None
+            if not is_planned and is_finger and self._intent_source.has_effect_at(contact):
+                count += 1
+        if count:
+            self._count_too_late(count)
 
     def look_again(self) -> None:
         """Note that the next plan can differ even if no contact changes."""

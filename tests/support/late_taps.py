@@ -70,6 +70,10 @@ class Clicks:
                 ends.append(math.inf if pulse is None else pulse.end)
         return HapticIntent(tuple(targets), until=min(ends, default=math.inf))
 
+    def has_effect_at(self, contact: Contact) -> bool:
+        """Return True: every contact has one."""
+        return True
+
 
 def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counter[str]:
     """Tap on a plate with amplifiers on one line; count what `COLUMNS` names, and what is wrong."""

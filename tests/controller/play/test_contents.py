@@ -339,6 +339,10 @@ class FeelsCourse:
             return HapticIntent((target,), until=pulse.end)
         return HapticIntent((target, Target(first.key, 14.0, pulse=self.tap)), until=self.tap.end)
 
+    def has_effect_at(self, contact: Contact) -> bool:
+        """Return True: every contact has one."""
+        return True
+
     @property
     def started_at(self) -> float:
         """When [s] the only course has started on the amplifiers."""

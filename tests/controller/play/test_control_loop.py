@@ -113,6 +113,10 @@ class Always:
             raise Planted("no intent")
         return HapticIntent(tuple(Target(each.key, 20.0) for each in contacts))
 
+    def has_effect_at(self, contact: Contact) -> bool:
+        """Return True: every contact has one."""
+        return True
+
 
 @dataclass
 class Played(Acted):

@@ -62,6 +62,10 @@ class EachItsOwn:
         gains = {(each.key, False): self.gain_db for each in contacts}
         return HapticIntent(targets, gains_db=gains)
 
+    def has_effect_at(self, contact: Contact) -> bool:
+        """Return True: every contact has one."""
+        return True
+
 
 @cache
 def eight_eras() -> Rig:

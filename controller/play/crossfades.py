@@ -16,8 +16,8 @@ import numpy as np
 
 from controller.play.intent import FADED_AFTER, NOTHING, Content, Question, Selection
 from controller.play.joint_answers import SHORT_OF, Shape, answered, selection_of
+from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import CROSSFADE, FALL_AFTER
 from controller.sources.touch import ContactKey
 from model.answer.answer import APART_HZ, SAME_LEVEL, Answer
 from model.answer.plan import worst_of

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from controller.play.intent import Content, Pulse
+from controller.play.layers import CROSSFADE, MIN_LEFT, MIN_VALID_FOR, Slot
 from controller.play.routing import (
     BESIDE_CLICK,
     HELD,
@@ -25,7 +26,6 @@ from controller.play.routing import (
     thinned,
 )
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import CROSSFADE, MIN_LEFT, MIN_VALID_FOR, Slot
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import QUANTITIES

@@ -17,9 +17,9 @@ from controller.play.chooser import Chooser
 from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import Content, IntentSource, Pulse, Selection, no_layer_free
 from controller.play.layer_sets import Sets
+from controller.play.layers import Slot
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import Slot
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Slots
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Contact, ContactKey

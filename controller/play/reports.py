@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.play.intent import FingerSensation, Selection, not_served
+from controller.play.layers import Slot
 from controller.play.planner import Plan
 from controller.play.routing import Drive
-from controller.play.slot import Slot
 from controller.sources.touch import Change, Contact, ContactKey
 from model.answer.answer import Layer
 
@@ -28,7 +28,8 @@ class PlayReport:
     reason: str = ""
     """Why all channels are silent."""
     contents: Mapping[int, Slot] = field(default_factory=dict)
-    """Copies of the slots as they are played, by layer, the newest one last; empty in silence."""
+    """Copies of the slots as they are played, by layer; empty in silence. The slots that the plan
+    started come last."""
     quiet: tuple[Contact, ...] = ()
     """Contacts without a target, which are kept quiet."""
     quiet_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
@@ -38,22 +39,22 @@ class PlayReport:
 
     @property
     def newest(self) -> Slot:
-        """The content that changed last."""
+        """The last slot, which is a started one if the plan started any."""
         return [*self.contents.values()][-1]
 
     @property
     def layer(self) -> Layer:
-        """The layer of the newest content as it plays."""
+        """The layer of the newest slot as it plays."""
         return self.newest.layer
 
     @property
     def drive(self) -> Drive:
-        """The tones of the newest content, by ERA, without silent ones."""
+        """The tones of the newest slot, by ERA, without silent ones."""
         return self.newest.drive
 
     @property
     def felt(self) -> FingerSensation | None:
-        """The sensation of the newest content's finger; None without a content."""
+        """The sensation of the finger that owns the newest content; None without a content."""
         for slot in reversed([*self.contents.values()]):
             if slot.content.sensations:  # not a side band
                 return slot.content.finger_sensations[0]
@@ -67,47 +68,55 @@ def play_report(
 
     playing: slots by layer; sent_at [s]: when the sets start, None if there are no sets.
     """
+    selection = plan.selection
     latency = None if sent_at is None else sent_at - plan.since
-    is_silent = plan.sets.silence is not None or not plan.selection.contents
-    if is_silent:
-        reason = plan.sets.reason or plan.selection.reason or ""
+    if plan.sets.silence is not None or not selection.contents:
+        reason = plan.sets.reason or selection.reason or ""
         return PlayReport(
             plan.contacts,
-            _silent_targets(plan.selection, reason),
+            _silent_targets(selection, reason),
             latency=latency,
             time=now,
             is_touch=plan.is_touch,
             reason=reason,
         )
-    selection = plan.selection
-    # The slots that the plan started come last.
-    numbers = sorted(playing, key=lambda number: number in plan.sets.started)
-    contents = {
-        number: replace(playing[number])
-        for number in numbers
-        if playing[number].content in selection.contents
-    }
-    quiet_levels = {
-        contact.key: selection.foreign_levels.get(contact.key, ()) for contact in selection.quiet
-    }
+    quiet_levels = dict[ContactKey, Sequence[float]]()
+    for contact in selection.quiet:
+        quiet_levels[contact.key] = selection.foreign_levels.get(contact.key, ())
     return PlayReport(
         plan.contacts,
         selection.finger_sensations,
         latency=latency,
         time=now if sent_at is None else sent_at,
         is_touch=plan.is_touch,
-        contents=contents,
+        contents=_played_slots(plan, playing),
         quiet=selection.quiet,
         quiet_levels=quiet_levels,
         settled_after=plan.sets.settled_after,
     )
 
 
+def _played_slots(plan: Plan, playing: Mapping[int, Slot]) -> dict[int, Slot]:
+    """Return copies of the slots of a plan by layer; the slots that it started come last."""
+    former_slots = dict[int, Slot]()
+    started_slots = dict[int, Slot]()
+    for number, slot in playing.items():
+        if slot.content not in plan.selection.contents:
+            continue
+        slots = started_slots if number in plan.sets.started else former_slots
+        slots[number] = replace(slot)
+    return former_slots | started_slots
+
+
 def _silent_targets(selection: Selection, reason: str) -> tuple[FingerSensation, ...]:
     """Return the targets of a selection that is not played, with their own reasons or this one."""
-    unserved = {finger.contact.key: finger for finger in selection.unserved}
-    contacts = dict.fromkeys([finger.contact for finger in selection.targets])
-    return tuple([unserved.get(contact.key) or not_served(contact, reason) for contact in contacts])
+    targets = dict[ContactKey, FingerSensation]()
+    for contact, _ in selection.targets:
+        targets[contact.key] = not_served(contact, reason)
+    for unserved in selection.unserved:
+        if unserved.contact.key in targets:
+            targets[unserved.contact.key] = unserved
+    return tuple(targets.values())
 
 
 @dataclass(frozen=True)

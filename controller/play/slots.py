@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from controller.play.intent import FADED_AFTER, Content
-from controller.play.layer_allocation import LayerAllocation
 from controller.play.layer_sets import SetBuilder, Sets
+from controller.play.layers import LayerAllocation, Slot, SlotPhase, settling_time
 from controller.play.routing import (
     HELD,
     PlateLayer,
@@ -21,7 +21,6 @@ from controller.play.routing import (
     tones_by_era,
 )
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import Slot, SlotPhase, settling_time
 from controller.sources.touch import ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet

@@ -32,10 +32,9 @@ from controller.play.intent import (
     Selection,
     Target,
 )
-from controller.play.layer_allocation import LayerAllocation
+from controller.play.layers import CROSSFADE, LayerAllocation, Slot, SlotPhase
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import PlaybackCapabilities
-from controller.play.slot import CROSSFADE, Slot, SlotPhase
 from controller.play.slots import Slots
 from controller.sources.touch import Contact, ContactKey
 from kit.chain import FINGER, set_running

@@ -23,8 +23,8 @@ from cases import shortly
 from controller.play.crossfades import Crossfades
 from controller.play.intent import HapticIntent, Target
 from controller.play.joint_answers import answered, with_paths
+from controller.play.layers import CROSSFADE
 from controller.play.reports import PlayReport
-from controller.play.slot import CROSSFADE
 from controller.sources.touch import AT_REST, Contact, ContactKey
 from drivers.host.group import Group
 from kit.chain import Chain, Position

@@ -14,6 +14,7 @@ import asyncio
 import re
 from collections.abc import Callable
 from contextvars import ContextVar
+from enum import Enum
 from pathlib import Path
 from typing import Any, cast
 
@@ -146,11 +147,20 @@ class Connections:
             connection.abort()
 
 
+class _Phase(Enum):
+    """Phase of the present request of a connection."""
+
+    RECEIVED = "none, or a part of its head was received"
+    QUEUED = "waits for its turn"
+    SERVED = "from the end of its head to its response"
+    WEBSOCKET = "has become a WebSocket, which the connection stays until its end"
+
+
 class ClientConnection(asyncio.BufferedProtocol):
     """A client's connection, which hands one request at a time on to the web server's protocol.
 
-    A request is received (`_input`), waits for its turn (`_permit`), and is served
-    (`_is_serving`), from `start_request` to `finish`. Only then does the next one take a turn.
+    A request is received, waits for its turn (`_permit`), and is served from `start_request` to
+    `finish`. Only then does the next one take a turn.
 
     make_server: makes the web server's protocol, for the first request.
     """
@@ -164,14 +174,14 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._shared = shared
         self._received = memoryview(bytearray(_MAX_READ))
         self._input = RequestInput()
-        self._permit: asyncio.Future[None] | None = None  # the turn of the next request
-        self._is_urgent = False  # whether the next request may silence
-        self._is_serving = False  # from the end of a request's head to its response
+        self._phase = _Phase.RECEIVED
+        self._permit: asyncio.Future[None] | None = None  # the turn of the present request
+        self._is_urgent = False  # whether the present request may silence
         self._body: StreamReader | None = None  # body of the present request
         self._is_half_closed = False  # whether the client has closed its side
-        self._is_websocket = False
         self._discards_input = False  # whether the rest of a request is not parsed
         self._requesting = asyncio.Lock()  # held during a request to the daemon
+        self._closing_client: asyncio.Task[None] | None = None  # closes the client of the daemon
 
     @property
     def address(self) -> str:
@@ -215,7 +225,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def eof_received(self) -> bool:
         """Answer requests that the client sent before it closed its side; close a WebSocket."""
-        if self._is_websocket or not self._has_request:
+        if not self._has_request:
             return False
         self._is_half_closed = True
         self._fail_incomplete_body()
@@ -265,7 +275,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def upgrade(self) -> None:
         """Become a WebSocket."""
-        self._is_websocket = True
+        self._phase = _Phase.WEBSOCKET
         self._hand_on_body()
 
     async def request(self, method: str, params: ApiMessage) -> Any:
@@ -286,7 +296,8 @@ class ClientConnection(asyncio.BufferedProtocol):
         """Wait for the next request; the client has the same time to read the response."""
         if self._body is not None and not self._body.is_eof():
             self._discard_input()
-        self._is_serving = False
+        if self._phase is _Phase.SERVED:
+            self._phase = _Phase.RECEIVED
         self._shared.start_waiting(self)
         self._transport.resume_reading()
         self._start_next_request()
@@ -298,11 +309,11 @@ class ClientConnection(asyncio.BufferedProtocol):
     @property
     def _has_request(self) -> bool:
         """Whether a request is served, or waits for its turn."""
-        return self._is_serving or self._permit is not None
+        return self._phase in (_Phase.QUEUED, _Phase.SERVED)
 
     def _start_next_request(self) -> None:
         """Hand the next request on in its turn, or immediately if it may silence."""
-        if self._has_request:
+        if self._phase is not _Phase.RECEIVED:
             return
         if not self._input.is_amid_head:
             self._input.skip_empty_lines()
@@ -312,11 +323,13 @@ class ClientConnection(asyncio.BufferedProtocol):
         if self._is_urgent:
             self._hand_on_head()
         else:
+            self._phase = _Phase.QUEUED
             self._permit = self._shared.turns.take()
             self._permit.add_done_callback(self._take_turn)
 
     def _take_turn(self, permit: "asyncio.Future[None]") -> None:
         self._permit = None
+        self._phase = _Phase.RECEIVED
         # A connection that is lost just as its turn comes cannot cancel the turn any more.
         if not permit.cancelled() and not self.is_closing:
             self._hand_on_head()
@@ -324,18 +337,20 @@ class ClientConnection(asyncio.BufferedProtocol):
     def _hand_on_head(self) -> None:
         """Hand on the received part of the next request's head."""
         head = self._input.take_head()
-        self._is_serving = not self._input.is_amid_head
+        if not self._input.is_amid_head:
+            self._phase = _Phase.SERVED
         if self._server is None:
             self._server = self._make_server()
             CONNECTION.set(self)
             self._server.connection_made(self._transport)
         self._server.data_received(head)
-        if self._is_half_closed and not self._is_serving:
+        if self._is_half_closed and self._phase is _Phase.RECEIVED:
             self._transport.close()
 
     def _hand_on_body(self) -> None:
         """Pass on the received part of the current request's body, or of WebSocket frames."""
-        part = self._input.take_all() if self._is_websocket else self._input.take_body()
+        is_websocket = self._phase is _Phase.WEBSOCKET
+        part = self._input.take_all() if is_websocket else self._input.take_body()
         if part and self._server is not None:
             self._server.data_received(part)
 

@@ -71,21 +71,20 @@ _logger = logging.getLogger(__name__)
 
 
 class Connection(asyncio.BufferedProtocol):
-    """A client's connection, with the server's and the methods' state of the client."""
+    """A client's connection: its input line by line, its bounded output, and its server's state."""
 
     _transport: asyncio.Transport
 
     def __init__(self, server: "ApiServer") -> None:
-        self.name = "unnamed client"
+        self.name = "unnamed client"  # until it introduces itself
         self.process = 0  # its id; 0 if unknown
         self.received_at = server.clock()  # s; when the last bytes arrived
+        self.is_at_end = False  # whether no more bytes are read; received lines are still served
+        # State of the server:
         self.is_reserve = False  # whether it is in reserve
-        self.is_at_end = False  # whether no further line is read or served
-        self.pending: set[asyncio.Task[None]] = set()
+        self.pending: set[asyncio.Task[None]] = set()  # requests without responses
         self.silencing_count = 0  # its stops and disarms so far
         self.touched_at = -math.inf  # s; when it last sent fingers, unless it has lifted them since
-        self.lease = ""  # token of the last lease it armed or renewed
-        self.number: int | None = None  # index among the clients that have touched
         self.rate = RateLimiter(MAX_REQUEST_RATE, clock=server.clock)
         self._server = server
         self._received = memoryview(bytearray(_MAX_READ))
@@ -189,7 +188,7 @@ class Connection(asyncio.BufferedProtocol):
         return lines
 
     def close_if_finished(self) -> None:
-        """Close after the last response, if no further line is read from the client."""
+        """Close after the last response, if no more bytes are read from the client."""
         if self.is_at_end and not self.has_lines and not self.pending:
             self.close()
 

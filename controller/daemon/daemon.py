@@ -12,7 +12,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,13 +24,13 @@ from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway
 from controller.daemon.config import DaemonConfig, load_daemon_config, loopback_address
 from controller.daemon.handlers import ApiService
-from controller.daemon.layouts import ConfigChange, LayoutChoice, TouchInputs, read_again, release
+from controller.daemon.layouts import LayoutChoice, TouchInputs
 from controller.daemon.messages import EventPublisher
-from controller.effects.effect import Effect
+from controller.daemon.reload import ConfigReload
 from controller.gateway.gateway_settings import require_gateway
 from controller.operation.operation_states import ENERGISED, Operation
 from controller.operation.plate_controller import Controller
-from controller.operation.supervisor import Supervisor
+from controller.operation.supervisor import LinkChange, Supervisor
 from controller.play.reports import Observers
 from controller.process.daemon_process import (
     MIN_DESCRIPTORS,
@@ -51,7 +51,7 @@ from model.table.table import LocalizationTable
 from model.table.table_file import cached_table, load_table
 from registry import threads
 from registry.service_manager import ServiceManager
-from registry.threads import DaemonThreads, in_thread, leave_work, no_long_collections
+from registry.threads import DaemonThreads, leave_work, no_long_collections
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
 _IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
@@ -71,7 +71,7 @@ class Daemon:
     watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
 
     Its parts are the attributes `controller`, `supervisor`, `publisher`, `layouts`, `inputs`, `api`
-    and `server`; `config` is the configuration in use.
+    and `server`.
     """
 
     def __init__(
@@ -87,24 +87,16 @@ class Daemon:
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
-        self.config = config.for_table(table.frequencies)
-        self._frequencies = table.frequencies
-        self._released: list[Effect] = []  # of replaced layouts, not freed yet
+        rendered_config = config.for_table(table.frequencies)
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
         self._shows_token = shows_token
         self._gateway: asyncio.Task[None] | None = None
-        self._reload_requested = asyncio.Event()
-        self._next_reload = asyncio.get_running_loop().create_future()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self.layouts = LayoutChoice(self.config, table.frequencies, changed=self._layout_changed)
-        self.publisher = EventPublisher(
-            operation=lambda: self.supervisor.operation,
-            amplifiers=self._amplifier_statuses,
-            layouts=self.layouts,
-            inputs=lambda: self.inputs.event,
+        self.layouts = LayoutChoice(
+            rendered_config, table.frequencies, changed=self._layout_changed
         )
         self.controller = Controller(
             config.rig,
@@ -120,18 +112,32 @@ class Daemon:
         self.supervisor = Supervisor(
             self.controller,
             state_changed=(self._publish_state, self._notify_manager),
-            link_changed=lambda *change: self.publisher.link_changed(*change),
+            link_changed=self._publish_link,
             alive=lambda: manager.alive(threads.now()),
         )
         self.started = self.supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
+        self._config_reload = ConfigReload(
+            rendered_config,
+            table.frequencies,
+            self.layouts,
+            is_armed=self._is_armed,
+            started=self._reload_started,
+            ended=self._reload_ended,
+        )
         cycle = self.controller.cycle
         cycle.tracker.max_fingers = config.section.max_fingers
-        self.publisher.observe(cycle.observers)
-        observe(cycle.observers)
         self.inputs = TouchInputs(
             cycle.deliver, cycle.lift, rejects=cycle.rejects, changed=self._inputs_changed
         )
+        self.publisher = EventPublisher(
+            operation=lambda: self.supervisor.operation,
+            amplifiers=self._amplifier_statuses,
+            layouts=self.layouts,
+            inputs=lambda: self.inputs.event,
+        )
+        self.publisher.observe(cycle.observers)
+        observe(cycle.observers)
         self.api = ApiService(
             # Without layouts, so that these can be freed once they are replaced.
             replace(config, layouts={}),
@@ -150,6 +156,14 @@ class Daemon:
             stop_all=self.supervisor.stop_anyhow,
             clock=threads.now,
         )
+
+    @property
+    def config(self) -> DaemonConfig:
+        """The configuration in use."""
+        return self._config_reload.config
+
+    def _publish_link(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        self.publisher.link_changed(change, lost, message)
 
     def _publish_state(self, old: Operation, new: Operation) -> None:
         self.publisher.state_changed(old, new)
@@ -182,8 +196,8 @@ class Daemon:
         loop.set_default_executor(DaemonThreads())
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
-        loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)
-        self._reloading = asyncio.create_task(self._reload_when_requested(), name="reloads")
+        loop.add_signal_handler(signal.SIGHUP, self._config_reload.request)
+        reloading = asyncio.create_task(self._config_reload.run(), name="reloads")
         running: asyncio.Task[None] | None = None
         try:
             await self.server.open(lock.bind())
@@ -206,6 +220,7 @@ class Daemon:
             shutdown.cancel()
             started.cancel()
         finally:
+            reloading.cancel()
             await self._close(running)
         if not running.cancelled():
             running.result()
@@ -220,57 +235,16 @@ class Daemon:
 
         While one is being read, all further requests are combined into one after it.
         """
-        self._reload_requested.set()
-        return await asyncio.shield(self._next_reload)
+        return await self._config_reload.result()
 
-    async def _reload_when_requested(self) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            await self._reload_requested.wait()
-            self._reload_requested.clear()
-            verdict = self._next_reload
-            self._next_reload = loop.create_future()
-            self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-            result = await self._reload_now()
-            reasons = "; ".join(result.reasons)
-            if result.reloaded:
-                _logger.info("config: reloaded: %s", reasons)
-            else:
-                _logger.error("config: reload rejected, keeping previous: %s", reasons)
-            self._manager.ready(self._status_line())
-            verdict.set_result(result)
+    def _is_armed(self) -> bool:
+        return self.supervisor.operation.state in ENERGISED
 
-    async def _reload_now(self) -> ReloadResult:
-        is_done = False
-        try:
-            change = await self._read_again()
-            is_armed = self.supervisor.operation.state in ENERGISED
-            reasons = change.refusals(is_armed=is_armed)
-            if reasons:
-                reasons += [f"{text}, but not applied" for text in change.changes]
-            else:
-                reasons = [*change.changes, *self.layouts.apply(change)] or ["nothing has changed"]
-                self.config = change.config
-                is_done = True
-            self._released = change.effects
-            del change
-            await release(self._released)
-        except (InputError, OSError) as error:
-            reasons = [line.strip() for line in str(error).splitlines()]
-        except Exception as error:  # systemd and clients wait for the end of the reload
-            _logger.exception("config: reload failed")
-            reasons = [f"a bug in the daemon ({type(error).__name__}); its log has the details"]
-        return ReloadResult(reloaded=is_done, reasons=reasons)
+    def _reload_started(self) -> None:
+        self._manager.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
-    async def _read_again(self) -> ConfigChange:
-        """Read the configuration again in a thread, which keeps no reference to either one."""
-        changes = []
-
-        def read() -> None:
-            changes.append(read_again(self.config, self._frequencies))
-
-        await in_thread(read, name="reload")
-        return changes.pop()
+    def _reload_ended(self) -> None:
+        self._manager.ready(self._status_line())
 
     def _layout_changed(self) -> None:
         self.publisher.hub.publish("layout", self.layouts.event)
@@ -279,7 +253,6 @@ class Daemon:
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""
         self._manager.notify("STOPPING=1")
-        self._reloading.cancel()
         try:
             await self.supervisor.close(self._shutdown_cause)
         finally:

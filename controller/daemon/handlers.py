@@ -95,7 +95,9 @@ class ApiService:
         self._reload = reload
         self._next_number = itertools.count(1)
         self._started = threads.now()
-        self._clients = set[Connection]()  # connected, and active at least once
+        self._clients = set[Connection]()  # connected, and introduced or have touched
+        self._numbers: dict[Connection, int] = {}  # of the clients that have touched
+        self._lease_tokens: dict[Connection, str] = {}  # last lease that each armed or renewed
         self._strengths = layouts.player.strengths
         self._saving: asyncio.Task[None] | None = None
         self._save_problem = ""  # error of the last attempt
@@ -108,19 +110,25 @@ class ApiService:
     def client_left(self, client: Connection) -> None:
         """Release the lease and subscriptions of a disconnected client; lift its fingers."""
         self._publisher.hub.forget(client)
-        if client.number is not None:
-            self._controller.cycle.lift(f"{_origin(client)}:")
+        if client in self._numbers:
+            self._controller.cycle.lift(f"{self._origin(client)}:")
+        self._numbers.pop(client, None)
+        self._lease_tokens.pop(client, None)
         self._clients.discard(client)
         self._clients_changed()
 
     def _clients_changed(self) -> None:
         """Pass the names of all clients to the strengths, which the control loop reads."""
-        self._strengths.clients = [(_origin(client), client.name) for client in self._clients]
+        self._strengths.clients = [(self._origin(client), client.name) for client in self._clients]
+
+    def _origin(self, client: Connection) -> str:
+        """Return the origin of a client's touches: the prefix of its source names."""
+        return f"{API_SOURCES}:{self._numbers.get(client)}"
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
         lease = self._supervisor.operation.lease_at(threads.now())
-        return lease is not None and client.lease == lease.token
+        return lease is not None and self._lease_tokens.get(client) == lease.token
 
     def hello(self, client: Connection, params: HelloParams) -> HelloResult:
         """Introduce the client; returns the daemon's rig, table and layout."""
@@ -195,7 +203,7 @@ class ApiService:
         except BaseException:
             self._supervisor.withdraw(lease.token, "arming failed")
             raise
-        client.lease = lease.token
+        self._lease_tokens[client] = lease.token
         # After the reply was sent, or could not be sent.
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
@@ -204,7 +212,7 @@ class ApiService:
         """Extend the lease."""
         lease = check_lease(self._supervisor.operation.lease, params.lease, threads.now())
         self._supervisor.renew(lease)
-        client.lease = lease.token
+        self._lease_tokens[client] = lease.token
         return RenewResult(lease_s=lease.duration)
 
     async def disarm(self, client: Connection, params: DisarmParams) -> Empty:
@@ -257,13 +265,13 @@ class ApiService:
 
     def touch(self, client: Connection, params: TouchParams) -> Empty:
         """Report all fingers of a touch source."""
-        if client.number is None:
-            client.number = next(self._next_number)
+        if client not in self._numbers:
+            self._numbers[client] = next(self._next_number)
             self._clients.add(client)
             self._clients_changed()
         touches = [_touch_at(point, self._config.rig.plate) for point in params.touches]
         # Two clients with the same source name are two sources.
-        origin = _origin(client)
+        origin = self._origin(client)
         source = f"{origin}:{params.source}"
         frame = TouchFrame(source, client.received_at, tuple(touches), origin=origin)
         self._controller.cycle.deliver(frame)
@@ -412,6 +420,7 @@ class ApiService:
     def _check_holder(self, client: Connection, token: str) -> None:
         """Disarm if the client disconnected before it received its lease."""
         if client.has_left:
+            self._lease_tokens.pop(client, None)
             self._supervisor.withdraw(token, "the arming client disconnected")
 
 
@@ -435,11 +444,6 @@ def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
             remedy="wait until it expires, or disarm first (any client can disarm)",
         )
     return lease
-
-
-def _origin(client: Connection) -> str:
-    """Return the origin of a client's touches: the prefix of its source names."""
-    return f"{API_SOURCES}:{client.number}"
 
 
 def _armed_already(operation: Operation) -> RpcError:

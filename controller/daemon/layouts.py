@@ -1,23 +1,20 @@
-"""Parts that a running daemon can replace: surface layouts, configuration, touch inputs.
+"""The surface layouts and touch inputs of a running daemon.
 
-`LayoutChoice` holds the layouts and the current one. `read_again` reads the configuration again and
-returns a `ConfigChange` with the changes that can be applied; it blocks, and runs outside the event
-loop because comparing large layouts takes a while. `TouchInputs` runs the configured touch sources.
+`LayoutChoice` holds the layouts and the current one. `TouchInputs` runs the configured touch
+sources.
 """
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import InputsEvent, LayoutEvent
 from controller.api.schema import TouchInputStatus
-from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, TouchInput
-from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
@@ -27,56 +24,14 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from registry import threads
 from registry.plugins import did_you_mean, failure_text
-from registry.threads import Backoff, in_thread, without_collections
+from registry.threads import Backoff, in_thread
 
 _logger = logging.getLogger(__name__)
 
-_APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
 _MIN_PAUSE = 1.0  # s; before a failed source is restarted
 _MAX_PAUSE = 30.0  # s
 SOURCE_CLOSE_TIMEOUT = 0.2  # s
 WATCH_INTERVAL = 1.0  # s; between checks of all inputs
-
-
-@dataclass(frozen=True)
-class ConfigChange:
-    """A configuration, and its differences from the current one."""
-
-    config: DaemonConfig
-    restart: list[str]
-    """Changed keys that need a restart."""
-    changes: list[str]
-    """Descriptions of all other changes."""
-    layouts: frozenset[str | None]
-    """Names of the changed layouts; None: the default layout of a configuration without layouts."""
-    old_max_db_sl: float
-    max_db_sl: float
-    """Highest level of all layouts, before and after [dB SL]."""
-    effects: list[Effect]
-    """All effects of both configurations; see `release`."""
-
-    def refusals(self, *, is_armed: bool) -> list[str]:
-        """Return the reasons for rejecting the configuration; empty if it can be applied."""
-        reasons = [f"{key}: changed, which needs a restart" for key in self.restart]
-        if is_armed and self.max_db_sl > self.old_max_db_sl:
-            reasons.append(
-                f"maximum level must not increase while armed, got {self.max_db_sl:g} dB SL (was "
-                f"{self.old_max_db_sl:g}); disarm, then reload"
-            )
-        return reasons
-
-
-def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
-    """Read a daemon's configuration again for a table's frequencies [Hz]; blocks.
-
-    Raises the errors of `read_in_child`.
-    """
-    with without_collections():  # large layouts would take long
-        change = config_change(old, read_in_child(old.source, frequencies))
-        layouts = change.config.layouts
-        changed_layouts = {name: layouts[name] for name in layouts if name in change.layouts}
-        warn_of_bands(changed_layouts, frequencies)
-        return change
 
 
 def warn_of_bands(layouts: Mapping[str | None, SurfaceLayout], frequencies: FloatArray) -> None:
@@ -84,66 +39,6 @@ def warn_of_bands(layouts: Mapping[str | None, SurfaceLayout], frequencies: Floa
     for name, layout in layouts.items():
         for problem in layout.band_problems(frequencies):
             _logger.warning("layout %s: %s", name, problem)
-
-
-def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
-    """Compare all keys and layouts, and the content of the rig's file."""
-    old_values = old.section.model_dump()
-    new_values = new.section.model_dump()
-    restart = [key for key in old_values if _needs_restart(key, old_values, new_values)]
-    if old.rig_text != new.rig_text and "rig" not in restart:
-        restart.append("rig")
-    changed: set[str | None] = set()
-    changes = []
-    for name in {**old.layouts, **new.layouts}:
-        if old.layouts.get(name) == new.layouts.get(name):
-            continue
-        changed.add(name)
-        if name is None:
-            continue
-        if name not in old.layouts:
-            changes.append(f"layouts.{name}: added")
-        elif name in new.layouts:
-            changes.append(f"layouts.{name}: changed")
-        else:
-            changes.append(f"layouts.{name}: removed")
-    old_level = old_values["level_db_sl"]
-    new_level = new_values["level_db_sl"]
-    if old_level != new_level:
-        changes.append(f"level_db_sl: from {old_level:g} to {new_level:g}")
-    layouts = dict(new.layouts)
-    for name in layouts.keys() - changed:
-        layouts[name] = old.layouts[name]
-    return ConfigChange(
-        config=replace(new, layouts=layouts),
-        restart=restart,
-        changes=changes,
-        layouts=frozenset(changed),
-        old_max_db_sl=max([layout.max_db_sl for layout in old.layouts.values()]),
-        max_db_sl=max([layout.max_db_sl for layout in new.layouts.values()]),
-        effects=[*_effects_of(old), *_effects_of(new)],
-    )
-
-
-def _needs_restart(key: str, old: Mapping[str, object], new: Mapping[str, object]) -> bool:
-    """Whether a key of the configuration has changed that a running daemon cannot apply."""
-    return key not in _APPLIED and old[key] != new[key]
-
-
-def _effects_of(config: DaemonConfig) -> list[Effect]:
-    """Return the effects of all layouts."""
-    return [effect for layout in config.layouts.values() for effect in layout.effects.values()]
-
-
-async def release(effects: list[Effect]) -> None:
-    """Free the effects of replaced layouts, one in each turn of the event loop.
-
-    The caller must hold no other reference to these layouts. Freeing an object together with all
-    its contents blocks the interpreter, so layouts of many files must not be freed as a whole.
-    """
-    while effects:
-        effects.pop()
-        await asyncio.sleep(0)
 
 
 class LayoutChoice:
@@ -183,16 +78,20 @@ class LayoutChoice:
         if name != self.name:
             self._play(name)
 
-    def apply(self, change: ConfigChange) -> list[str]:
-        """Apply the layouts of a configuration that was read again; the current name is kept.
+    def apply(
+        self,
+        layouts: Mapping[str | None, SurfaceLayout],
+        changed_names: Collection[str | None],
+    ) -> list[str]:
+        """Replace the layouts, some of which have changed; the current name is kept.
 
         If the current layout was removed, switches to the first and returns a note, otherwise [].
         """
-        self._layouts = change.config.layouts
-        if self.name not in self._layouts:
-            self._play(next(iter(self._layouts)))
+        self._layouts = layouts
+        if self.name not in layouts:
+            self._play(next(iter(layouts)))
             return [f"current layout: {self.name or 'none'}"]
-        if self.name in change.layouts:
+        if self.name in changed_names:
             self._play(self.name)
         return []
 

@@ -21,7 +21,7 @@ from controller.api.link import default_socket
 from controller.cli.config_cli import config_app
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DAEMON, DaemonConfig, DaemonSection, load_daemon_config
-from controller.daemon.layouts import config_change
+from controller.daemon.reload import config_change
 from controller.process.child import child_command
 from controller.sources.touch import Touch
 from kit.clock import in_virtual_time

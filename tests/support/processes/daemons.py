@@ -187,7 +187,7 @@ async def daemon_at(
     daemon = Daemon(config, table(config.rig), log=log, manager=manager, dashboard=None)
     chain = chain_of(daemon, far) if is_virtual else None
     if not has_reader:
-        patch.setattr("controller.daemon.layouts.read_in_child", _read_here)
+        patch.setattr("controller.daemon.reload.read_in_child", _read_here)
     task = asyncio.create_task(daemon.run(lock))
     logging.getLogger().addHandler(log)
     try:

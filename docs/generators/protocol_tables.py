@@ -209,6 +209,14 @@ def fields(record: Record, meanings: Mapping[str, str]) -> str:
     return _table(("field", "meaning"), rows)
 
 
+def _status_meanings() -> Mapping[str, str]:
+    """Return the meanings of the fields of Status; of a later reading, its own."""
+    meanings = dict(_STATUS_MEANINGS)
+    for reading in READINGS:
+        meanings.setdefault(reading.name, f"{reading.meaning}; 0: not stated")
+    return meanings
+
+
 def readings() -> str:
     """Return the readings of Status, and where they are shown."""
     rows = (
@@ -317,7 +325,7 @@ TABLES: Mapping[str, Mapping[str, Callable[[], str]]] = {
             messages(), records(), _lists({**_LISTS, "Codes of a Nak": REFUSALS})
         ),
         "capabilities": lambda: fields(MESSAGES["GetCaps"].reply, _CAPABILITY_MEANINGS),
-        "status": lambda: fields(STATUS, _STATUS_MEANINGS),
+        "status": lambda: fields(STATUS, _status_meanings()),
         "states": lambda: _blocks(transitions(), _lists({"States": STATES, "Faults": FAULTS})),
     },
     "metrics": {"readings": readings},

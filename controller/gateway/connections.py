@@ -147,8 +147,8 @@ class Connections:
             connection.abort()
 
 
-class _Phase(Enum):
-    """Phase of the present request of a connection."""
+class _Stage(Enum):
+    """Stage of the present request of a connection."""
 
     RECEIVED = "none, or a part of its head was received"
     QUEUED = "waits for its turn"
@@ -174,7 +174,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._shared = shared
         self._received = memoryview(bytearray(_MAX_READ))
         self._input = RequestInput()
-        self._phase = _Phase.RECEIVED
+        self._stage = _Stage.RECEIVED
         self._permit: asyncio.Future[None] | None = None  # the turn of the present request
         self._is_urgent = False  # whether the present request may silence
         self._body: StreamReader | None = None  # body of the present request
@@ -275,7 +275,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def upgrade(self) -> None:
         """Become a WebSocket."""
-        self._phase = _Phase.WEBSOCKET
+        self._stage = _Stage.WEBSOCKET
         self._hand_on_body()
 
     async def request(self, method: str, params: ApiMessage) -> Any:
@@ -296,8 +296,8 @@ class ClientConnection(asyncio.BufferedProtocol):
         """Wait for the next request; the client has the same time to read the response."""
         if self._body is not None and not self._body.is_eof():
             self._discard_input()
-        if self._phase is _Phase.SERVED:
-            self._phase = _Phase.RECEIVED
+        if self._stage is _Stage.SERVED:
+            self._stage = _Stage.RECEIVED
         self._shared.start_waiting(self)
         self._transport.resume_reading()
         self._start_next_request()
@@ -309,11 +309,11 @@ class ClientConnection(asyncio.BufferedProtocol):
     @property
     def _has_request(self) -> bool:
         """Whether a request is served, or waits for its turn."""
-        return self._phase in (_Phase.QUEUED, _Phase.SERVED)
+        return self._stage in (_Stage.QUEUED, _Stage.SERVED)
 
     def _start_next_request(self) -> None:
         """Hand the next request on in its turn, or immediately if it may silence."""
-        if self._phase is not _Phase.RECEIVED:
+        if self._stage is not _Stage.RECEIVED:
             return
         if not self._input.is_amid_head:
             self._input.skip_empty_lines()
@@ -323,13 +323,13 @@ class ClientConnection(asyncio.BufferedProtocol):
         if self._is_urgent:
             self._hand_on_head()
         else:
-            self._phase = _Phase.QUEUED
+            self._stage = _Stage.QUEUED
             self._permit = self._shared.turns.take()
             self._permit.add_done_callback(self._take_turn)
 
     def _take_turn(self, permit: "asyncio.Future[None]") -> None:
         self._permit = None
-        self._phase = _Phase.RECEIVED
+        self._stage = _Stage.RECEIVED
         # A connection that is lost just as its turn comes cannot cancel the turn any more.
         if not permit.cancelled() and not self.is_closing:
             self._hand_on_head()
@@ -338,18 +338,18 @@ class ClientConnection(asyncio.BufferedProtocol):
         """Hand on the received part of the next request's head."""
         head = self._input.take_head()
         if not self._input.is_amid_head:
-            self._phase = _Phase.SERVED
+            self._stage = _Stage.SERVED
         if self._server is None:
             self._server = self._make_server()
             CONNECTION.set(self)
             self._server.connection_made(self._transport)
         self._server.data_received(head)
-        if self._is_half_closed and self._phase is _Phase.RECEIVED:
+        if self._is_half_closed and self._stage is _Stage.RECEIVED:
             self._transport.close()
 
     def _hand_on_body(self) -> None:
         """Pass on the received part of the current request's body, or of WebSocket frames."""
-        is_websocket = self._phase is _Phase.WEBSOCKET
+        is_websocket = self._stage is _Stage.WEBSOCKET
         part = self._input.take_all() if is_websocket else self._input.take_body()
         if part and self._server is not None:
             self._server.data_received(part)

@@ -162,17 +162,11 @@ class Supervisor:
 
         The actions are completed even if the caller is cancelled.
         """
-        try:
-            await asyncio.shield(self._spawn(self._applied(event)))
-        except (DriverError, asyncio.CancelledError):
-            raise
-        except Exception as error:
-            await self._fail(error)
-            raise
+        await asyncio.shield(self._spawn(self._guarded(self._apply(event))))
 
     def post(self, event: DaemonEvent) -> None:
         """Apply an event immediately and carry out its actions in a task."""
-        self._spawn(self._in_background(self._applied(event)))
+        self._in_background(self._apply(event))
 
     def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, StopOutcome]]:
         """Quick-stop all amplifiers in any state; await the outcome of each, by name.
@@ -220,8 +214,8 @@ class Supervisor:
         is_named = lost is not None and name in (lost.names or self.controller.urls)
         return self.controller.what_may_play(name, self.operation.cause if is_named else "")
 
-    def _applied(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
-        """Apply an event; await its actions."""
+    def _apply(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
+        """Apply an event immediately; return its actions, which must be awaited in a task."""
         actions = self.step(event)
         return self._carry_out(actions, self.operation.epoch)
 
@@ -273,15 +267,28 @@ class Supervisor:
         task.add_done_callback(self.tasks.discard)
         return task
 
-    async def _in_background(self, work: Awaitable[object]) -> None:
-        """Await work without a caller: its errors are already part of the state."""
+    async def _guarded(self, work: Awaitable[object]) -> None:
+        """Await work that is not part of other guarded work; stop all if it fails unexpectedly."""
         try:
             await work
+        except DriverError:
+            raise
+        except Exception as error:
+            await self._fail(error)
+            raise
+
+    def _in_background(self, work: Awaitable[object]) -> "asyncio.Task[None]":
+        """Run guarded work without a caller in a task; its errors are part of the state."""
+        return self._spawn(self._logged(work))
+
+    async def _logged(self, work: Awaitable[object]) -> None:
+        """Await guarded work, and log its error."""
+        try:
+            await self._guarded(work)
         except DriverError as error:
             _logger.info("failed: %s", error)
-        except Exception as error:
+        except Exception:
             _logger.exception("failed, stopping all amplifiers")
-            await self._fail(error)
 
     async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
         """Carry out the actions of a transition to an epoch, one after the other."""
@@ -297,7 +304,7 @@ class Supervisor:
                     await self._stop()
                 case Action.REACT:
                     await self._stop()
-                    await self.handle(DaemonEvent(Trigger.REACTION_DONE))
+                    await self._apply(DaemonEvent(Trigger.REACTION_DONE))
                 case Action.CLEAR:
                     await self._over_link(self._clear(epoch), epoch)
                 case Action.RECONNECT:
@@ -316,9 +323,9 @@ class Supervisor:
                     await self._handle_loss(error)
                 case Trigger.DISARM:
                     cause = "an amplifier did not reply to arm"
-                    await self.handle(DaemonEvent(Trigger.DISARM, cause))
+                    await self._apply(DaemonEvent(Trigger.DISARM, cause))
                 case Trigger.FAULT:
-                    await self.handle(DaemonEvent(Trigger.FAULT, str(error)))
+                    await self._apply(DaemonEvent(Trigger.FAULT, str(error)))
             raise
 
     def _trigger_of(self, error: DriverError, epoch: int) -> Trigger | None:
@@ -337,7 +344,7 @@ class Supervisor:
 
     async def _arm(self) -> None:
         await self.controller.arm()
-        await self.handle(DaemonEvent(Trigger.ARMED, self.operation.cause))
+        await self._apply(DaemonEvent(Trigger.ARMED, self.operation.cause))
 
     async def _stop(self) -> None:
         await self._stopped(self.controller.stop())
@@ -347,7 +354,7 @@ class Supervisor:
     ) -> Mapping[str, StopOutcome]:
         """Await a stop; the loss of an amplifier is handled after its return."""
         stopped = await stopping
-        self._spawn(self._check_links())  # which may stop all once more
+        self._in_background(self._check_links())  # which may stop all once more
         return stopped
 
     async def _verify(self, epoch: int) -> None:
@@ -360,9 +367,9 @@ class Supervisor:
             return  # stopped, or verified and armed, in the meantime
         if problem is None:
             cause = "all amplifiers are disarmed, at level zero and without a fault"
-            await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
+            await self._apply(DaemonEvent(Trigger.VERIFIED, cause))
         else:
-            await self.handle(DaemonEvent(Trigger.FAULT, problem))
+            await self._apply(DaemonEvent(Trigger.FAULT, problem))
 
     async def _clear(self, epoch: int) -> None:
         self._clears.append(epoch)
@@ -372,9 +379,9 @@ class Supervisor:
             self._clears.remove(epoch)
         self._check_none_since(epoch)
         if problem is None:
-            await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
+            await self._apply(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
             return
-        await self.handle(DaemonEvent(Trigger.FAULT, problem))
+        await self._apply(DaemonEvent(Trigger.FAULT, problem))
         raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
     def _check_none_since(self, epoch: int) -> None:
@@ -414,7 +421,7 @@ class Supervisor:
         if self.closing.is_set():
             await self.controller.close()
         else:
-            await self._in_background(self.handle(event))
+            await asyncio.shield(self._in_background(self._apply(event)))
 
     @property
     def _must_reopen(self) -> bool:
@@ -487,16 +494,13 @@ class Supervisor:
                 self._link_changed("lost", lost, str(error))
             cause = f"amplifier {', '.join(lost)}: {error}" if lost else str(error)
             event = DaemonEvent(Trigger.LINK_LOST, cause, _remedy_of(error), amplifiers=lost)
-            await self.handle(event)
+            await self._apply(event)
 
     async def _check_links(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
         causes = self.controller.group.members.lost_by.values()
         if causes and not self._is_loss_handled:
-            try:
-                await self._handle_loss(LinkError(next(iter(causes))))
-            except Exception:
-                _logger.exception("handling of a lost link failed")
+            await self._handle_loss(LinkError(next(iter(causes))))
 
     @property
     def _is_loss_handled(self) -> bool:
@@ -534,7 +538,7 @@ class Supervisor:
 
     def _link_lost(self, cause: str) -> None:
         if not self._is_loss_handled:
-            self._spawn(self._in_background(self._handle_loss(LinkError(cause))))
+            self._in_background(self._handle_loss(LinkError(cause)))
 
     def _check_own_stop(self, cause: str) -> None:
         """Post a fault if the control loop itself has stopped the amplifiers of an armed plate."""
@@ -594,7 +598,7 @@ class Supervisor:
             await self._check_disarmed()
         except LinkError as error:
             if not self.controller.group.members.is_degraded_only(error):
-                await self._in_background(self._handle_loss(error))
+                await asyncio.shield(self._in_background(self._handle_loss(error)))
         except DriverError:
             pass  # preempted by another request, which reports for itself
         except Exception:
@@ -610,7 +614,8 @@ class Supervisor:
         problem = find_problem(statuses, group.amplifiers)
         match self.operation.state:
             case DaemonState.READY_TO_SWITCH_ON if problem is not None:
-                await self._in_background(self.handle(DaemonEvent(Trigger.FAULT, problem)))
+                event = DaemonEvent(Trigger.FAULT, problem)
+                await asyncio.shield(self._in_background(self._apply(event)))
             case DaemonState.QUICK_STOP_ACTIVE | DaemonState.FAULT:
                 is_cleared = epoch in self._clears  # a clear reads back for itself
                 if not is_cleared and not are_silent(statuses, group.amplifiers):

@@ -8,10 +8,11 @@ same, and never too little.
 import asyncio
 import random
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -468,6 +469,27 @@ async def test_failing_action_ends_in_a_stop(
             assert made.far_end.requests("Stop", *(["Disarm"] if action else []))
             assert made.far_end.state != "OPERATION_ENABLED"
         await arm_again(made)
+
+
+@in_virtual_time
+async def test_failing_fault_reaction_stops_once() -> None:
+    """An exception in the reaction to a polled fault leads to one more stop, in one more epoch."""
+    async with watched() as daemon:
+        controller, failures = daemon.controller, [Planted("stop")]
+        stop = controller.stop
+
+        def fail_once() -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
+            if failures:
+                raise failures.pop()
+            return stop()
+
+        controller.stop = fail_once
+        epoch = daemon.supervisor.operation.epoch
+        daemon.answer("GetStatus", state="FAULT", fault="INTERNAL")
+        await asyncio.sleep(2)
+        assert daemon.state is DaemonState.FAULT
+        assert len(daemon.far_end.requests("Stop")) == 1
+        assert daemon.supervisor.operation.epoch == epoch + 2  # the fault, and the exception
 
 
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"

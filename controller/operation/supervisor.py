@@ -547,10 +547,10 @@ class Supervisor:
             self.post(DaemonEvent(Trigger.FAULT, cause))
 
     def _check_degraded(self) -> None:
-        """Report that armed amplifiers have stopped replying, or that all reply again."""
+        """Report which armed amplifiers have stopped replying, or that all reply again."""
         group = self.controller.group
         degraded = group.members.degraded
-        is_reported = bool(degraded) is bool(self.operation.degraded)
+        is_reported = degraded == self.operation.degraded
         if self.operation.state is not DaemonState.OPERATION_ENABLED or is_reported:
             return
         if group.members.lost_by:

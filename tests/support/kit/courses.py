@@ -264,10 +264,10 @@ class Acted(Taken, Chain):
         for each in self.far_ends if of is None else [self.far_ends[of]]:
             each.fault(kind, **given)
 
-    def recovers(self) -> None:
-        """End all faults."""
-        for each in self.far_ends:
-            each.recover()
+    def recovers(self, of: int | None = None) -> None:
+        """End all faults, or those of one amplifier by its number."""
+        for far_end in self.far_ends if of is None else [self.far_ends[of]]:
+            far_end.recover()
 
     def delays(self, seconds: float) -> None:
         """Let replies of all amplifiers leave them so much later."""

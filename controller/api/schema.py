@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from drivers.host.clock import ReportKind
+from drivers.host.status_reports import ReportKind
 
 API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""

@@ -6,10 +6,10 @@ A single contradiction may be a moment between two sets; several in a row are a 
 import math
 
 from drivers.errors import CommandRefused
-from drivers.host.clock import HeldClock, armed_problem
+from drivers.host.clock import HeldClock
 from drivers.host.ledger import Ledger
 from drivers.host.watchdog import Feeding
-from drivers.protocol.definition import MAX_AHEAD, QUANTITIES
+from drivers.protocol.definition import FAULTS, MAX_AHEAD, QUANTITIES, STATUS_FLAGS, name_of
 from drivers.protocol.records import Values
 
 MAX_CONTRADICTIONS = 2
@@ -18,6 +18,8 @@ MAX_START_ERROR = 0.003
 """If a start is known worse than this [s], statuses are not compared."""
 _SAME_MOMENT = 0.01  # s; contradictions of statuses closer to each other than this count once
 _LEFT = QUANTITIES["watchdog_left"]
+_OPEN = 1 << STATUS_FLAGS["interlock_open"]
+_HIGH_VOLTAGE = 1 << STATUS_FLAGS["high_voltage"]
 
 
 class StatusContradictions:
@@ -135,3 +137,20 @@ def contradicted(name: str, problem: str) -> CommandRefused:
         f"amplifier {name} contradicts its requests: {problem}; look for a derated or broken "
         "channel, an exchanged cable or firmware, then clear and arm again"
     )
+
+
+def armed_problem(status: Values, latch: int | None) -> str | None:
+    """Describe a value in a status that an armed amplifier must not report; None without one.
+
+    latch: from the reply to Arm, or None before that; a newer stop or fault would have disarmed the
+    amplifier.
+    """
+    if not status["flags"] & _HIGH_VOLTAGE:
+        return "high voltage must be on, got off"
+    if status["flags"] & _OPEN:
+        return "interlock must be closed while armed, got open"
+    if status["fault"]:
+        return f"fault must be NONE while armed, got {name_of(FAULTS, status['fault'])}"
+    if latch not in (None, status["latch"]):
+        return f"latch must be {latch} since it was armed, got {status['latch']}"
+    return None

@@ -153,7 +153,7 @@ class Daemon:
             on_disconnect=self.api.client_left,
             holds_lease=self.api.holds_lease,
             is_busy=lambda: cycle.is_preparing,
-            stop_all=self.supervisor.stop_anyhow,
+            stop_all=self.supervisor.stop_despite_failure,
             clock=threads.now,
         )
 

@@ -44,7 +44,7 @@ from controller.daemon.plate_view import PlateView
 from controller.effects.layout import SurfaceLayout
 from controller.effects.strengths import UNNAMED
 from controller.operation.operation_states import DaemonState, Operation
-from controller.operation.supervisor import LinkChange
+from controller.operation.reopening import LinkChange
 from controller.play.reports import Observers, PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier

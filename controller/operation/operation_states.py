@@ -268,7 +268,7 @@ def step(
     return _enter(operation, updated, transition.to, event), transition.actions
 
 
-def failed(operation: Operation, cause: str) -> Operation:
+def after_exception(operation: Operation, cause: str) -> Operation:
     """Return the operation after an unexpected exception: latched, and in FAULT if open."""
     epoch = operation.epoch + 1
     if operation.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):

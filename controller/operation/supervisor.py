@@ -1,27 +1,28 @@
 """Supervisor of a plate: its operation, its links, and the handling of faults and losses.
 
-Only the supervisor replaces the operation. An event replaces it (`step`), the controller carries
-out the resulting actions, and the outcome of each action at the amplifiers is the next event.
-Actions come before observers, which are called a moment later, each guarded (`DeferredCalls`).
+An event replaces the operation (`CurrentOperation`), the controller carries out the resulting
+actions, and the outcome of each action at the amplifiers is the next event. Actions come before
+observers, which are called a moment later, each guarded (`DeferredCalls`).
 
 Actions run in tasks of their own (`_spawn`). A caller that is cancelled, such as the request of a
 client that has left, stops waiting, but the task continues to its end. `run` waits for all tasks
 before it returns; only a cancellation of `run` ends them early. A stop does not wait for these
-tasks: its requests to the amplifiers are queued before the operation changes.
+tasks: its requests to the amplifiers are queued before the operation changes. An exception that no
+action expects stops all amplifiers in one place (`_guarded`).
 
-The supervisor also runs the control loop, polls disarmed amplifiers, and opens lost ones again.
+The supervisor also runs the control loop, `StatusPolling` of disarmed amplifiers, and the
+`Reopening` of lost ones.
 """
 
 import asyncio
-import contextlib
 import logging
-import secrets
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
-from controller.operation.deferred_calls import DeferredCalls, call_guarded
+from controller.operation.current_operation import CurrentOperation, StateObserver
+from controller.operation.deferred_calls import call_guarded
 from controller.operation.operation_states import (
     ENERGISED,
     Action,
@@ -30,13 +31,17 @@ from controller.operation.operation_states import (
     Lease,
     Operation,
     Trigger,
-    failed,
     fault_remedy,
-    not_reopened,
-    step,
 )
 from controller.operation.plate_controller import Controller
-from controller.operation.read_back import are_silent, find_problem, is_any_armed
+from controller.operation.read_back import find_problem, is_any_armed
+from controller.operation.reopening import (
+    LinkChange,
+    LinkObserver,
+    Reopening,
+    reopening_remedy,
+)
+from controller.operation.status_polling import SILENT_GROUP, StatusPolling
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -44,36 +49,23 @@ from drivers.errors import (
     LinkDegraded,
     LinkError,
     Preempted,
-    WrongAmplifier,
 )
 from drivers.host.amplifier import Amplifier
-from drivers.host.group_states import GroupState
 from drivers.host.stops import StopOutcome
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
 from drivers.protocol.records import Values
-from model.errors import InputError
 from registry import threads
-from registry.plugins import failure_text
-from registry.threads import pauses
 
-STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
-_RECHECK = 0.05  # s; between checks of the watchdog of a lost amplifier
+_LOOP_PAUSE = 0.05  # s; before the control loop runs again after a failure
 _READ_BACK_INTERVAL = 0.02  # s
 _MAX_READ_BACKS = 15
-_EPOCHS = 2**31  # a daemon starts at a random one; all are exact as JSON numbers
 
 LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
-_REOPENING = "the daemon reconnects on its own and stays disarmed"
-_SILENT = (GroupState.DISARMED, GroupState.STOPPED)
 
 _LOG_LEVELS = {
     DaemonState.COMM_LOST: logging.ERROR,
     DaemonState.FAULT_REACTION_ACTIVE: logging.ERROR,
 }
-
-LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
-StateObserver = Callable[[Operation, Operation], None]
-"""Receives the operation before and after a change."""
 
 _logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -96,29 +88,53 @@ class Supervisor:
         controller: Controller,
         *,
         state_changed: Sequence[StateObserver],
-        link_changed: Callable[[LinkChange, Sequence[str], str], None],
+        link_changed: LinkObserver,
         alive: Callable[[], None],
     ) -> None:
         self.controller = controller
-        # Differs from the epochs of an earlier daemon, whose clients may reconnect.
-        self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
-        """The current operation; only `_replace_operation` changes it."""
-        self.started = asyncio.Event()  # the amplifiers are open, or searched for
+        self.current = CurrentOperation(
+            (_log_transition, *state_changed), lease_over=partial(self.post, LEASE_OVER)
+        )
+        """The current operation."""
+        self.started = asyncio.Event()
+        """Set once the amplifiers are open, or searched for."""
         self.closing = asyncio.Event()
-        self._changed = asyncio.Event()  # set by a change of state, cleared by `run`
-        self._state_observers = (_log_transition, *state_changed)
+        """Set once the daemon ends."""
+        self.tasks: set[asyncio.Task[Any]] = set()
+        """Actions in progress."""
+        self._reopening = Reopening(
+            controller,
+            self.current,
+            self._report_link,
+            may_play=self.assume_energised,
+            is_closing=self.closing.is_set,
+            reconnected=partial(self.handle, DaemonEvent(Trigger.RECONNECTED)),
+        )
+        self._polling = StatusPolling(
+            controller,
+            self.current,
+            is_over=self._is_polling_over,
+            is_clearing=self._is_clearing,
+            lost=self._lost_while_disarmed,
+            faulty=self._faulty_while_disarmed,
+            stop=self._quick_stop,
+        )
         self._link_observer = link_changed
         self._alive = alive
-        self._reports = DeferredCalls()
-        self.tasks: set[asyncio.Task[Any]] = set()  # actions in progress
-        self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
-        self._clears: list[int] = []  # epochs of clears in progress
-        self._lease_timer: asyncio.TimerHandle | None = None
+        self._loss_lock = asyncio.Lock()
+        """Held until the lost amplifiers are closed."""
+        self._clears: list[int] = []
+        """Epochs of clears in progress."""
         controller.connected.insert(0, self._listen)
         loop = controller.cycle.observers
-        loop.refused.insert(0, self._check_own_stop)
-        loop.link_lost.insert(0, self._link_lost)
+        loop.refused.insert(0, self._report_own_stop)
+        loop.link_lost.insert(0, self._lost_in_control_loop)
         loop.cycle_completed.insert(0, self._cycle_completed)
+
+    @property
+    def operation(self) -> Operation:
+        """The current operation."""
+        return self.current.value
 
     def _listen(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Listen to amplifiers, by name, whose lines have just been opened."""
@@ -132,30 +148,30 @@ class Supervisor:
         in a fault leads to the state FAULT. Raises CommandError and InputError for amplifiers that
         do not fit the configuration, RuntimeError if the control loop ends early.
         """
-        loop = asyncio.create_task(self._run_control_loop(), name="control loop")
+        control_loop = asyncio.create_task(self._run_control_loop(), name="control loop")
         try:
             await self._open()
             self.started.set()
             while self.operation.state is not DaemonState.NOT_READY:
-                if loop.done():
+                if control_loop.done():  # it never ends by itself, so it was cancelled
                     raise RuntimeError("control loop has ended before the daemon")
-                self._changed.clear()
-                if self._must_reopen:
-                    await self._restore_link()
+                self.current.note_seen()
+                if self._reopening.is_due:
+                    await self._reopening.run()
                 else:
-                    await self._poll()
+                    await self._polling.poll()
         finally:
             while self.tasks:  # a task may start another one
                 await asyncio.gather(*self.tasks, return_exceptions=True)
-            loop.cancel()
-            await asyncio.gather(loop, return_exceptions=True)
-            self._reports.flush()
+            control_loop.cancel()
+            await asyncio.gather(control_loop, return_exceptions=True)
+            self.current.reports.flush()
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; then `run` ends."""
         self.closing.set()
         await self.handle(DaemonEvent(Trigger.CLOSE, cause))
-        self._reports.flush()
+        self.current.reports.flush()
 
     async def handle(self, event: DaemonEvent) -> None:
         """Apply an event and carry out its actions; raises the error of an action.
@@ -174,11 +190,11 @@ class Supervisor:
         The requests to the amplifiers are queued when this returns. They come before the event, so
         that no failure of the transition can delay them; the event therefore has no action.
         """
-        stopping = self._spawn(self._stopped(self.controller.stop_all()))
-        self.step(DaemonEvent(Trigger.STOP, cause, remedy))
+        stopping = self._spawn(self._await_stop(self.controller.stop_all()))
+        self.current.apply(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
 
-    def stop_anyhow(self) -> Awaitable[object]:
+    def stop_despite_failure(self) -> Awaitable[object]:
         """Stop all amplifiers, and latch that, after `stop` has failed for a client.
 
         The failure may lie in `stop_all`, which also waits for closed lines to open. So this calls
@@ -188,12 +204,13 @@ class Supervisor:
         try:
             return asyncio.ensure_future(self.controller.group.stop())
         finally:
-            call_guarded(partial(self.step, DaemonEvent(Trigger.STOP, cause, fault_remedy(cause))))
+            event = DaemonEvent(Trigger.STOP, cause, fault_remedy(cause))
+            call_guarded(partial(self.current.apply, event))
 
     def renew(self, lease: Lease) -> Lease:
         """Return the lease of the client that armed, renewed; it must not have ended."""
         renewed = lease.renewed(threads.now())
-        self._replace_operation(replace(self.operation, lease=renewed))
+        self.current.replace(replace(self.operation, lease=renewed))
         return renewed
 
     def withdraw(self, token: str, cause: str) -> None:
@@ -204,9 +221,10 @@ class Supervisor:
 
     def assume_energised(self, now: float) -> bool:
         """Whether a lost amplifier may still be playing at a time [s]."""
-        return self.operation.lost is not None and any(
-            now < self.what_may_play(name).may_play_until for name in self.controller.urls
-        )
+        if self.operation.lost is None:
+            return False
+        ends = [self.what_may_play(name).may_play_until for name in self.controller.urls]
+        return now < max(ends, default=now)
 
     def what_may_play(self, name: str) -> StopOutcome:
         """Return what an amplifier may be playing, and why no more is known."""
@@ -216,47 +234,13 @@ class Supervisor:
 
     def _apply(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
         """Apply an event immediately; return its actions, which must be awaited in a task."""
-        actions = self.step(event)
+        actions = self.current.apply(event)
         return self._carry_out(actions, self.operation.epoch)
 
-    def step(self, event: DaemonEvent) -> tuple[Action, ...]:
-        """Apply one transition; return its actions."""
-        try:
-            operation, actions = step(self.operation, event, threads.now())
-        except Exception as error:
-            operation = failed(self.operation, failure_text(error))
-            actions = (Action.STOP,)
-        self._replace_operation(operation)
-        return actions
-
-    def _replace_operation(self, operation: Operation) -> None:
-        """Adopt an operation; notify the observers of a new epoch, and watch a new lease."""
-        last_operation = self.operation
-        self.operation = operation
-        if operation.epoch == last_operation.epoch:
-            return
-        self._changed.set()
-        for observer in self._state_observers:
-            self._reports.add(partial(observer, last_operation, operation))
-        if self._lease_timer is not None:
-            self._lease_timer.cancel()
-        if operation.state is DaemonState.OPERATION_ENABLED:
-            self.check_lease()
-
-    def check_lease(self) -> None:
-        """Disarm if the lease has expired, else check again when it will have."""
-        now = threads.now()
-        lease = self.operation.lease
-        if self.operation.is_lease_over(now):
-            self.post(LEASE_OVER)
-        elif lease is not None:
-            pause = lease.expires_at - now
-            self._lease_timer = asyncio.get_running_loop().call_later(pause, self.check_lease)
-
-    async def _fail(self, error: Exception) -> None:
+    async def _latch_and_stop(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
-        self._replace_operation(failed(self.operation, failure_text(error)))
-        await asyncio.shield(self._spawn(self._stop()))
+        self.current.latch(error)
+        await asyncio.shield(self._spawn(self._quick_stop()))
         if self.operation.state is DaemonState.COMM_LOST:  # what should have closed them has failed
             await self._carry_out([Action.RECONNECT], self.operation.epoch)
 
@@ -274,7 +258,7 @@ class Supervisor:
         except DriverError:
             raise
         except Exception as error:
-            await self._fail(error)
+            await self._latch_and_stop(error)
             raise
 
     def _in_background(self, work: Awaitable[object]) -> "asyncio.Task[None]":
@@ -301,15 +285,15 @@ class Supervisor:
                 case Action.DISARM:
                     await self._over_link(self.controller.disarm(), epoch)
                 case Action.STOP:
-                    await self._stop()
+                    await self._quick_stop()
                 case Action.REACT:
-                    await self._stop()
+                    await self._quick_stop()
                     await self._apply(DaemonEvent(Trigger.REACTION_DONE))
                 case Action.CLEAR:
                     await self._over_link(self._clear(epoch), epoch)
                 case Action.RECONNECT:
                     await self.controller.release()
-                    self._changed.set()
+                    self.current.note_change()
                 case Action.CLOSE:
                     await self.controller.close()
 
@@ -346,15 +330,16 @@ class Supervisor:
         await self.controller.arm()
         await self._apply(DaemonEvent(Trigger.ARMED, self.operation.cause))
 
-    async def _stop(self) -> None:
-        await self._stopped(self.controller.stop())
+    async def _quick_stop(self) -> None:
+        """Quick-stop all amplifiers on open lines."""
+        await self._await_stop(self.controller.stop())
 
-    async def _stopped(
+    async def _await_stop(
         self, stopping: Awaitable[Mapping[str, StopOutcome]]
     ) -> Mapping[str, StopOutcome]:
         """Await a stop; the loss of an amplifier is handled after its return."""
         stopped = await stopping
-        self._in_background(self._check_links())  # which may stop all once more
+        self._in_background(self._handle_new_loss())  # which may stop all once more
         return stopped
 
     async def _verify(self, epoch: int) -> None:
@@ -416,74 +401,13 @@ class Supervisor:
         try:
             await self.controller.open()
         except (LinkError, CommandRefused, FrameError) as error:
-            lost = self._not_opened(error)
-            event = DaemonEvent(Trigger.NOT_FOUND, str(error), _remedy_of(error), amplifiers=lost)
+            lost = self._reopening.report_failure(error)
+            remedy = reopening_remedy(error)
+            event = DaemonEvent(Trigger.NOT_FOUND, str(error), remedy, amplifiers=lost)
         if self.closing.is_set():
             await self.controller.close()
         else:
             await asyncio.shield(self._in_background(self._apply(event)))
-
-    @property
-    def _must_reopen(self) -> bool:
-        """Whether amplifiers are lost, and all lines are closed."""
-        return self.operation.state is DaemonState.COMM_LOST and self.controller.is_released
-
-    async def _restore_link(self) -> None:
-        """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""
-        try:
-            try:
-                await self._reconnect()
-            finally:
-                if self.operation.state is DaemonState.COMM_LOST:
-                    await self.controller.release()
-        except DriverError as error:
-            _logger.info("failed: %s", error)
-        except Exception:
-            _logger.exception("reconnection failed")
-            await self._pause(STATUS_INTERVAL)
-
-    async def _reconnect(self) -> None:
-        for pause in pauses():
-            if self.operation.state is not DaemonState.COMM_LOST:
-                return
-            if await self._reopen():
-                break
-            await self._pause(pause)
-        while self.assume_energised(threads.now()) and not self.closing.is_set():
-            await self._pause(_RECHECK)
-            await self.controller.group.statuses()  # a loud amplifier can have become silent
-        if self.controller.group.is_open:  # no further loss
-            await self.handle(DaemonEvent(Trigger.RECONNECTED))
-
-    async def _reopen(self) -> bool:
-        """Open and disarm all amplifiers, or release them; return whether that worked.
-
-        Ports stay open between attempts: a board may restart whenever its own is opened.
-        """
-        try:
-            await self.controller.open()
-            await self.controller.disarm()  # a short loss may not have expired the watchdog
-        except (DriverError, InputError) as error:
-            names = self._not_opened(error)
-            self._replace_operation(not_reopened(self.operation, error, _remedy_of(error), names))
-            if self.controller.group.is_open:
-                await self.controller.release()
-            return False
-        self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
-        return True
-
-    def _not_opened(self, error: Exception) -> tuple[str, ...]:
-        """Report that amplifiers could not be opened; return the names of the lost, if known."""
-        lost = error.lost if isinstance(error, LinkError) else ()
-        self._link_changed("retry", lost, str(error))
-        return lost
-
-    async def _pause(self, duration: float) -> None:
-        """Wait for a time [s]; `close`, or a stop, which reopens lines, ends the wait."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(duration):
-                await self._changed.wait()
-                self._changed.clear()
 
     async def _handle_loss(self, error: DriverError) -> None:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
@@ -491,12 +415,13 @@ class Supervisor:
             group = self.controller.group
             lost = (*group.members.lost_by, *group.members.degraded)
             if self.operation.state is not DaemonState.COMM_LOST:
-                self._link_changed("lost", lost, str(error))
+                self._report_link("lost", lost, str(error))
             cause = f"amplifier {', '.join(lost)}: {error}" if lost else str(error)
-            event = DaemonEvent(Trigger.LINK_LOST, cause, _remedy_of(error), amplifiers=lost)
+            remedy = reopening_remedy(error)
+            event = DaemonEvent(Trigger.LINK_LOST, cause, remedy, amplifiers=lost)
             await self._apply(event)
 
-    async def _check_links(self) -> None:
+    async def _handle_new_loss(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
         causes = self.controller.group.members.lost_by.values()
         if causes and not self._is_loss_handled:
@@ -507,8 +432,9 @@ class Supervisor:
         """Whether amplifiers are lost or closed already."""
         return self.operation.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
 
-    def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
-        self._reports.add(partial(self._link_observer, change, lost, message))
+    def _report_link(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        """Report a change of the links to the observer, a moment later."""
+        self.current.reports.add(partial(self._link_observer, change, lost, message))
 
     async def _run_control_loop(self) -> None:
         """Run the control loop; an unforeseen exception is a fault, which can be cleared."""
@@ -517,36 +443,38 @@ class Supervisor:
                 await self.controller.cycle.run()
             except Exception as error:
                 _logger.exception("control loop failed, stopping all amplifiers")
-                await self._stop_after(error)
-            await asyncio.sleep(_RECHECK)
+                await self._repeat_latch_and_stop(error)
+            await asyncio.sleep(_LOOP_PAUSE)
 
-    async def _stop_after(self, error: Exception) -> None:
+    async def _repeat_latch_and_stop(self, error: Exception) -> None:
         """Stop all amplifiers until that works; no heartbeat goes before."""
         while True:
             try:
-                return await self._fail(error)
+                return await self._latch_and_stop(error)
             except Exception:
                 _logger.exception("stop after a failure of the control loop failed")
-                await asyncio.sleep(_RECHECK)
+                await asyncio.sleep(_LOOP_PAUSE)
 
     def _cycle_completed(self) -> None:
-        self._check_own_stop(
+        """Report what the control loop has done to the amplifiers in a cycle."""
+        self._report_own_stop(
             "the control loop has stopped the amplifiers, because an exchange failed"
         )
-        self._check_degraded()
+        self._report_degraded()
         call_guarded(self._alive)
 
-    def _link_lost(self, cause: str) -> None:
+    def _lost_in_control_loop(self, cause: str) -> None:
+        """Handle a loss that the control loop has noticed."""
         if not self._is_loss_handled:
             self._in_background(self._handle_loss(LinkError(cause)))
 
-    def _check_own_stop(self, cause: str) -> None:
+    def _report_own_stop(self, cause: str) -> None:
         """Post a fault if the control loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
-        if is_armed and self.controller.group.state in _SILENT:
+        if is_armed and self.controller.group.state in SILENT_GROUP:
             self.post(DaemonEvent(Trigger.FAULT, cause))
 
-    def _check_degraded(self) -> None:
+    def _report_degraded(self) -> None:
         """Report which armed amplifiers have stopped replying, or that all reply again."""
         group = self.controller.group
         degraded = group.members.degraded
@@ -570,7 +498,7 @@ class Supervisor:
             remedy = "check cables and supply"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))
         _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
-        self._link_changed(change, degraded, cause)
+        self._report_link(change, degraded, cause)
 
     def _amplifier_event(self, name: str, event: Values) -> None:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
@@ -581,53 +509,22 @@ class Supervisor:
             cause += f", channel {event['channel']}"
         self.post(DaemonEvent(Trigger.FAULT, cause))
 
-    async def _poll(self) -> None:
-        """Wait for the next interval or a change of state, then check disarmed amplifiers.
+    def _is_polling_over(self) -> bool:
+        """Whether `run` ends, or must reopen lost amplifiers."""
+        return self.operation.state is DaemonState.NOT_READY or self._reopening.is_due
 
-        The control loop reads the status of armed ones.
-        """
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(STATUS_INTERVAL):
-                while self.operation.state is not DaemonState.NOT_READY and not self._must_reopen:
-                    await self._changed.wait()
-                    self._changed.clear()
-                return
-        if self.controller.group.state not in _SILENT:
-            return
-        try:
-            await self._check_disarmed()
-        except LinkError as error:
-            if not self.controller.group.members.is_degraded_only(error):
-                await asyncio.shield(self._in_background(self._handle_loss(error)))
-        except DriverError:
-            pass  # preempted by another request, which reports for itself
-        except Exception:
-            _logger.exception("status read failed")
+    def _is_clearing(self, epoch: int) -> bool:
+        """Whether a clear that began in an epoch is in progress."""
+        return epoch in self._clears
 
-    async def _check_disarmed(self) -> None:
-        """Read all statuses; post a fault, or repeat a stop that has not silenced all."""
-        epoch = self.operation.epoch
-        group = self.controller.group
-        statuses = await group.statuses()
-        if epoch != self.operation.epoch or group.members.disarming:
-            return  # they may have been read before, or during a ramp
-        problem = find_problem(statuses, group.amplifiers)
-        match self.operation.state:
-            case DaemonState.READY_TO_SWITCH_ON if problem is not None:
-                event = DaemonEvent(Trigger.FAULT, problem)
-                await asyncio.shield(self._in_background(self._apply(event)))
-            case DaemonState.QUICK_STOP_ACTIVE | DaemonState.FAULT:
-                is_cleared = epoch in self._clears  # a clear reads back for itself
-                if not is_cleared and not are_silent(statuses, group.amplifiers):
-                    _logger.error("stop repeated: %s", problem)
-                    await self._stop()
+    async def _lost_while_disarmed(self, error: LinkError) -> None:
+        """Handle the loss of a disarmed amplifier."""
+        await asyncio.shield(self._in_background(self._handle_loss(error)))
 
-
-def _remedy_of(error: Exception) -> str:
-    """Return the remedy for amplifiers that cannot be opened."""
-    if isinstance(error, WrongAmplifier):
-        return _REOPENING
-    return f"check cables and supply; {_REOPENING}"
+    async def _faulty_while_disarmed(self, problem: str) -> None:
+        """Handle a fault of a disarmed amplifier."""
+        event = DaemonEvent(Trigger.FAULT, problem)
+        await asyncio.shield(self._in_background(self._apply(event)))
 
 
 def _log_transition(old: Operation, new: Operation) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from cases import shortly
 from controller.daemon.amplifier_messages import amplifier_statuses
-from controller.operation import supervisor as supervisor_module
+from controller.operation import current_operation
 from controller.operation.operation_states import (
     TRANSITIONS,
     Action,
@@ -26,7 +26,7 @@ from controller.operation.operation_states import (
     DaemonState,
     Operation,
     Trigger,
-    failed,
+    after_exception,
     fault_remedy,
     step,
 )
@@ -161,7 +161,8 @@ STATES: Mapping[str, tuple[Sequence[Step], str, float | None]] = {
     "never reached, another answers": ([ANOTHER, "recovers", {"waits": 3}], MAY_PLAY, None),
     "lost while disarmed": ([*REACHED, *LOST], ELAPSED, 0.0),
     "lost while armed": ([*REACHED, "ARM", *LOST], ELAPSED, 0.0),
-    "mute while armed": ([*REACHED, "ARM", MUTE], ELAPSED, 0.0),
+    # Not during the first heartbeat, whose reply a stop awaits.
+    "mute while armed": ([*REACHED, "ARM", {"waits": 0.01}, MUTE], ELAPSED, 0.0),
     "lost, and opened anew in vain": ([*REACHED, "ARM", MUTE, {"waits": 20}], ELAPSED, 0.0),
     "lost, another answers": (
         [*REACHED, "ARM", UNPLUG, ANOTHER, "recovers", {"waits": 3}],
@@ -331,7 +332,7 @@ def test_degraded_link_changes_no_state(state: DaemonState) -> None:
 @pytest.mark.parametrize("state", DaemonState)
 def test_unexpected_exception_is_latched(state: DaemonState) -> None:
     """It is a fault where amplifiers are open, and elsewhere one once they are."""
-    after = failed(Operation(state), "a bug")
+    after = after_exception(Operation(state), "a bug")
     assert after.is_latched
     if state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         assert after.state is state
@@ -399,7 +400,7 @@ async def enter(made: Watched, state: DaemonState) -> None:
             await made.handle(DaemonEvent(Trigger.LINK_LOST, "test"))
         case _:
             latched = state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-            made.supervisor.operation = Operation(state, "test", is_latched=latched)
+            made.supervisor.current.value = Operation(state, "test", is_latched=latched)
     assert made.supervisor.operation.state is state
     made.far_end.asked.clear()
 
@@ -450,7 +451,7 @@ async def test_failing_action_ends_in_a_stop(
     """
     async with watched() as made:
         await enter(made, state)
-        place = made.controller if action else supervisor_module
+        place = made.controller if action else current_operation
         work, failures = getattr(place, name), [Planted(name)]
 
         def fail_once(*args: object) -> object:
@@ -666,7 +667,7 @@ async def test_stop_in_progress_is_not_repeated(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A look at the amplifiers finds it at work; one after its end, without silence, does not."""
-    monkeypatch.setattr("controller.operation.supervisor.STATUS_INTERVAL", 0.02)
+    monkeypatch.setattr("controller.operation.status_polling.STATUS_INTERVAL", 0.02)
     async with watched("main") as daemon:
         daemon.answer("Stop", "GetStatus", levels=[1000, 0, 0], state="QUICK_STOP_ACTIVE")
         stopping = asyncio.ensure_future(daemon.supervisor.stop("a test"))

@@ -155,9 +155,9 @@ class _Device:
             if not is_last(values):
                 self._assembly.keep(values, now)
                 return
-            stream = self._assembly.whole(values)
-            if isinstance(stream, int):
+            if self._assembly.first_missing(values) is not None:
                 return
+            stream = self._assembly.stream(values)
             driven = (
                 each.layer
                 for each in unpack_layers(stream)

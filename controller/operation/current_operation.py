@@ -77,9 +77,9 @@ class CurrentOperation:
         if self._lease_timer is not None:
             self._lease_timer.cancel()
         if operation.state is DaemonState.OPERATION_ENABLED:
-            self._check_lease()
+            self.check_lease()
 
-    def _check_lease(self) -> None:
+    def check_lease(self) -> None:
         """Report a lease that has expired, else check again when it will have."""
         now = threads.now()
         lease = self.value.lease
@@ -87,7 +87,7 @@ class CurrentOperation:
             self._lease_over()
         elif lease is not None:
             pause = lease.expires_at - now
-            self._lease_timer = asyncio.get_running_loop().call_later(pause, self._check_lease)
+            self._lease_timer = asyncio.get_running_loop().call_later(pause, self.check_lease)
 
     def note_change(self) -> None:
         """Wake the task that waits for a change."""

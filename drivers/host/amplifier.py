@@ -21,6 +21,7 @@ from drivers.host.requests import Priority
 from drivers.host.set_admission import IsPreempted, SetRequest
 from drivers.host.stops import CONFIRM_INTERVAL, PendingStop, StopOutcome
 from drivers.playing import AmplifierLayer
+from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.definition import (
     ATTEMPTS,
     ENABLED,
@@ -30,7 +31,7 @@ from drivers.protocol.definition import (
     STOP_RAMP,
 )
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem, is_newer_token
+from drivers.protocol.sets import LayerSet, is_newer_token
 from registry import threads
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -199,16 +200,16 @@ class Amplifier(AmplifierRecord):
         reply = await self.request("GetAchieved", {"layer": layer.layer}, Priority.SET)
         if layer.renew or reply["token"] != token:
             return layer
-        can = self.ledger.capabilities
-        problem = achieved_problem(layer, reply, can, is_exact=False, slack=_WIRE_ROUNDING)
-        achieved = achieved_layer(layer, reply, can)
+        capabilities = self.ledger.capabilities
+        problem = achieved_problem(layer, reply, capabilities, is_exact=False, slack=_WIRE_ROUNDING)
+        achieved = achieved_layer(layer, reply, capabilities)
         if problem is None:
             self.contradictions.note_achieved(None)
             self.ledger.correct(layer, achieved, token)
             return achieved
-        _, quantity, must, got = problem
         self.contradictions.note_achieved(
-            f"{quantity} in layer {layer.layer} must be {must}, got {got}"
+            f"{problem.quantity} in layer {layer.layer} must be {problem.required}, got "
+            f"{problem.received}"
         )
         return achieved
 

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import Literal
 
-from drivers.host.clock import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
+from drivers.host.clock import CLOCK_SETTLING, ClockProblem
+from drivers.host.clock_steering import MAX_CLOCK_RATE
 from drivers.protocol.definition import QUANTITIES, STATUS_FLAGS
 from drivers.protocol.records import Values
 

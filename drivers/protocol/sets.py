@@ -1,16 +1,14 @@
-"""Sets as streams of words: layers, parts and tokens, and the achieved playback.
+"""Sets as streams of words: layers, parts and tokens.
 
 All numbers are wire integers. A stream contains the layers changed by a set, one after the other; a
 part contains the values of a Set message, and the far end collects parts in an `Assembly`.
-`achieved_problem` compares the reply to GetAchieved with the required playback of a layer.
 """
 
 import math
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
-from typing import TypeAlias
 
 from drivers.protocol.definition import (
     COMMAND,
@@ -26,28 +24,30 @@ from drivers.protocol.records import Refusal, Values
 
 _SPAN = 1 << 16
 _LAST_TOKEN = QUANTITIES["token"].maximum
-PART_WORDS = MAX_WORDS - MESSAGES["Set"].request.words
+_PHASE = QUANTITIES["phase"]
+_SET = MESSAGES["Set"]
+PART_WORDS = MAX_WORDS - _SET.request.words
 MAX_PARTS = 127
 _LAYER, _AFTER, _RENEW, _COUNT = LAYER.shifts
 _HEAD_FORM, _COMMAND_FORM = LAYER.form, COMMAND.form
 _ENVELOPE_FORM, _KNOT_FORM = ENVELOPE.form, KNOT.form
 _CHANNEL, _KEEP_PHASE, _SKIP_ENDING, _ONSET, _ENDING = COMMAND.shifts
+_INDEX, _PARTS, _ = _SET.request.shifts
 _COUNTS = 1 << _RENEW - _COUNT
-_CHANNELS, _Q = QUANTITIES["channel"].maximum + 1, QUANTITIES
-_LOW, _HIGH = _Q["phase"].minimum, _Q["phase"].maximum
+_CHANNELS = QUANTITIES["channel"].maximum + 1
 _WIDEST: Values = {
-    "layers": _Q["layer"].maximum + 1,
+    "layers": QUANTITIES["layer"].maximum + 1,
     "channels": _CHANNELS,
-    "knots": _Q["knots"].maximum,
-    "ramp_max": _Q["ramp"].maximum,
-    "envelope_step_min": _Q["envelope_step"].minimum,
-    "envelope_step_max": _Q["envelope_step"].maximum,
+    "knots": QUANTITIES["knots"].maximum,
+    "ramp_max": QUANTITIES["ramp"].maximum,
+    "envelope_step_min": QUANTITIES["envelope_step"].minimum,
+    "envelope_step_max": QUANTITIES["envelope_step"].maximum,
     "limits": _CHANNELS
     * [
         {
-            "frequency_min": _Q["frequency"].minimum,
-            "frequency_max": _Q["frequency"].maximum,
-            "level_max": _Q["level"].maximum,
+            "frequency_min": QUANTITIES["frequency"].minimum,
+            "frequency_max": QUANTITIES["frequency"].maximum,
+            "level_max": QUANTITIES["level"].maximum,
         }
     ],
 }
@@ -171,10 +171,10 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
     return list(memoryview(struct.pack(form, *numbers)).cast("H"))
 
 
-def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet, ...]:
+def unpack_layers(words: Sequence[int], capabilities: Values = _WIDEST) -> tuple[LayerSet, ...]:
     """Return the layers of a stream; raises Refusal for the first error.
 
-    can: capabilities that limit the layers; by default the limits of the table.
+    capabilities: limit the layers; by default the limits of the table.
     """
     layers: list[LayerSet] = []
     at = 0
@@ -188,26 +188,36 @@ def unpack_layers(words: Sequence[int], can: Values = _WIDEST) -> tuple[LayerSet
             raise Refusal("renew must be without commands, after with some")
         if any(head["layer"] == layer.layer for layer in layers):
             raise Refusal(f"layer {head['layer']} must occur once in a set")
-        for name, highest in (("layer", can["layers"] - 1), ("ramp", can["ramp_max"])):
+        highest_layer = capabilities["layers"] - 1
+        for name, highest in (("layer", highest_layer), ("ramp", capabilities["ramp_max"])):
             if head[name] > highest:
                 raise Refusal(f"{name} must be at most {highest}, got {head[name]}")
-        commands: list[Command] = []
-        for _ in range(count):
-            channel = words[at] >> _CHANNEL & _CHANNELS - 1
-            if channel >= can["channels"] or any(channel == each.channel for each in commands):
-                text = f"channel must be 0 to {can['channels'] - 1}, once in a layer, got {channel}"
-                raise Refusal(text, "BAD_CHANNEL", channel)
-            try:
-                command, at = _command(words, at, can)
-            except Refusal as refusal:
-                raise Refusal(str(refusal), refusal.code, channel) from None
-            commands.append(command)
-        layers.append(LayerSet(commands=tuple(commands), **head))
+        commands, at = _commands(words, at, count, capabilities)
+        layers.append(LayerSet(commands=commands, **head))
     return tuple(layers)
 
 
+def _commands(
+    words: Sequence[int], at: int, count: int, capabilities: Values
+) -> tuple[tuple[Command, ...], int]:
+    """Return the commands of a layer, which begin at an index, and the index after them."""
+    channels = capabilities["channels"]
+    commands: list[Command] = []
+    for _ in range(count):
+        channel = words[at] >> _CHANNEL & _CHANNELS - 1
+        if channel >= channels or any(channel == command.channel for command in commands):
+            text = f"channel must be 0 to {channels - 1}, once in a layer, got {channel}"
+            raise Refusal(text, "BAD_CHANNEL", channel)
+        try:
+            command, at = _command(words, at, capabilities)
+        except Refusal as refusal:
+            raise Refusal(str(refusal), refusal.code, channel) from None
+        commands.append(command)
+    return tuple(commands), at
+
+
 def _check_length(words: Sequence[int], at: int) -> None:
-    """Raise Refusal where the stream ends amid the layer that begins at an index."""
+    """Raise Refusal if the stream ends within the layer that begins at an index."""
     try:
         count = words[at] & _COUNTS - 1
         at += LAYER.words
@@ -223,38 +233,43 @@ def _check_length(words: Sequence[int], at: int) -> None:
         raise Refusal("the stream must not end amid a layer", "BAD_LENGTH")
 
 
-def _command(words: Sequence[int], at: int, can: Values) -> tuple[Command, int]:
+def _command(words: Sequence[int], at: int, capabilities: Values) -> tuple[Command, int]:
+    """Return the command that begins at an index, and the index after it."""
     values, at = COMMAND.read(words, at)
     for name in ("keep_phase", "skip_ending"):
         values[name] = bool(values[name])
-    limits = can["limits"][values["channel"]]
+    limits = capabilities["limits"][values["channel"]]
     is_driven = values["level"] > 0 or values["onset"]
     low, high = limits["frequency_min"], limits["frequency_max"]
     if is_driven and not low <= values["frequency"] <= high:
         raise Refusal(f"frequency must be {low} to {high}, got {values['frequency']}")
     peaks = [values["level"]]
     for name in ("onset", "ending"):
-        values[name], at = _envelope(words, at, can) if values[name] else (None, at)
-        if values[name] is not None:
-            peaks.append(values[name].peak)
+        envelope = None
+        if values[name]:
+            envelope, at = _envelope(words, at, capabilities)
+            peaks.append(envelope.peak)
+        values[name] = envelope
     if max(peaks) > limits["level_max"]:
         raise Refusal(f"level must be at most {limits['level_max']}, got {max(peaks)}")
     return Command(**values), at
 
 
-def _envelope(words: Sequence[int], at: int, can: Values) -> tuple[Envelope, int]:
+def _envelope(words: Sequence[int], at: int, capabilities: Values) -> tuple[Envelope, int]:
+    """Return the envelope that begins at an index, and the index after it."""
     head, at = ENVELOPE.read(words, at)
-    low, high = can["envelope_step_min"], can["envelope_step_max"]
+    low, high = capabilities["envelope_step_min"], capabilities["envelope_step_max"]
     if not low <= head["step"] <= high:
         raise Refusal(f"step must be {low} to {high}, got {head['step']}")
-    if head["knots"] > can["knots"]:
-        raise Refusal(f"knots must be at most {can['knots']}, got {head['knots']}")
+    if head["knots"] > capabilities["knots"]:
+        raise Refusal(f"knots must be at most {capabilities['knots']}, got {head['knots']}")
     end = at + KNOT.words * head["knots"]
     raw = struct.pack(f"={end - at}H", *words[at:end])
     knots = tuple(struct.iter_unpack("=" + _KNOT_FORM, raw))
     phases = [phase for _, phase in knots]  # levels are compared with the limits of the channel
-    if phases and not _LOW <= min(phases) <= max(phases) <= _HIGH:
-        raise Refusal(f"phase must be {_LOW} to {_HIGH}, got {min(phases)} to {max(phases)}")
+    if phases and not _PHASE.minimum <= min(phases) <= max(phases) <= _PHASE.maximum:
+        allowed = f"{_PHASE.minimum} to {_PHASE.maximum}"
+        raise Refusal(f"phase must be {allowed}, got {min(phases)} to {max(phases)}")
     return Envelope(head["step"], knots), end
 
 
@@ -283,10 +298,12 @@ def is_last(part: Values) -> bool:
 
 def is_earlier_part(number: int, words: Sequence[int]) -> bool:
     """Whether words of a message are an earlier part of a set, even if they are invalid."""
-    message = MESSAGES["Set"]
-    at = message.request.places["index"]
-    is_headed = number == message.number and len(words) > at
-    return is_headed and words[at] >> 8 < (words[at] >> 1) % 128 - 1
+    at = _SET.request.places["index"]
+    if number != _SET.number or len(words) <= at:
+        return False
+    index = words[at] >> _INDEX
+    part_count = words[at] >> _PARTS & MAX_PARTS
+    return index < part_count - 1
 
 
 @dataclass
@@ -306,7 +323,7 @@ class Assembly:
         return now - self.began > STAGED_LIFE
 
     def keep(self, part: Values, now: float) -> bool:
-        """Keep a part but the last at a time [s]; False where `parts` is not as before."""
+        """Keep a part other than the last at a time [s]; False if `parts` is not as before."""
         token = part["token"]
         count = part["parts"]
         if token != self.token or self.is_expired(now):
@@ -318,97 +335,23 @@ class Assembly:
             self.collected[part["index"]] = part["stream"]
         return bool(count == self.count)
 
-    def whole(self, last: Values) -> list[int] | int:
-        """Return the stream of the set with this last part, or the first missing part."""
-        collected = self.collected if last["token"] == self.token else {}
-        indices = range(last["parts"] - 1)
-        missing = next((index for index in indices if index not in collected), None)
-        if missing is not None:
-            return missing
-        return [*chain.from_iterable(collected[index] for index in indices), *last["stream"]]
+    def first_missing(self, last: Values) -> int | None:
+        """Return the index of the first missing part of the set with this last part, if any."""
+        collected = self._collected_of(last)
+        for index in range(last["parts"] - 1):
+            if index not in collected:
+                return index
+        return None
 
+    def stream(self, last: Values) -> list[int]:
+        """Return the stream of the set with this last part; no part may be missing."""
+        collected = self._collected_of(last)
+        stream: list[int] = []
+        for index in range(last["parts"] - 1):
+            stream += collected[index]
+        stream += last["stream"]
+        return stream
 
-TONE = "frequency", "level", "phase"
-FLAGS = "after", "renew", "keep_phase", "skip_ending", "onset", "ending"
-"""Fields of layers and commands that GetAchieved does not have."""
-Problem: TypeAlias = tuple[str, str, object, object]
-"""A broken rule: subject, property, required value and received value."""
-_TURN = 36_000  # wire units; phases are modulo this
-_DERATED = 0.01  # tolerance of the ratios in a derated set
-
-
-def achieved_problem(
-    layer: LayerSet,
-    reply: Values,
-    can: Values,
-    *,
-    is_exact: bool,
-    can_scale: bool = False,
-    slack: float = 0.0,
-) -> Problem | None:
-    """Describe an error in a layer's achieved playback; None if it is within half a step.
-
-    can: capabilities. is_exact: equal to the word; can_scale: all levels can be lower by a common
-    factor; slack: in steps of the wire, in addition to the steps of the amplifier.
-    """
-    achieved = {command["channel"]: command for command in reply["commands"]}
-    levels: list[int] = []
-    shares: list[float] = []
-    beyond = achieved.keys() - {tone.channel for tone in layer.commands}
-    if beyond:
-        return "commit", "channels that are not driven", "none", sorted(beyond)
-    names = ("layer", "ramp") if achieved else ("layer",)
-    must = [getattr(layer, name) for name in names]
-    got_values = [reply[name] for name in names]
-    if must != got_values:
-        return "plays", ", ".join(names), must, got_values
-    for tone in layer.commands:
-        requested = {name: getattr(tone, name) for name in TONE}
-        got = achieved.get(tone.channel, {**requested, "level": 0})
-        for name in TONE if tone.level else ("level",):  # silence has no phase
-            error = abs(got[name] - requested[name])
-            error = min(error, _TURN - error) if name == "phase" else error
-            allowed = 0.0 if is_exact or not tone.level else _rounding(name, tone, can) + slack
-            is_scaled = can_scale and name == "level" and got[name] <= requested[name]
-            if error > allowed and not is_scaled:
-                quantity = f"error of achieved {name} of channel {tone.channel}"
-                rule = "plays" if tone.channel in achieved else "commit"
-                return rule, quantity, f"0 to {allowed:g}", error
-        if tone.level and can_scale:
-            levels.append(tone.level)
-            shares.append(got["level"] / tone.level)
-    difference = max(shares, default=0.0) - min(shares, default=0.0)
-    if difference > _DERATED + can.get("level_step", 1) / min(levels, default=1):
-        return "commit", "shares of its channels", "alike", sorted(shares)
-    return None
-
-
-def achieved_layer(layer: LayerSet, reply: Values, can: Values) -> LayerSet:
-    """Return a layer with the levels, frequencies and phases of a reply.
-
-    can: capabilities. A tone at level 0, possibly the target of an onset, stays unchanged if the
-    reported frequency is not its rounded value: an amplifier can report any.
-    """
-    achieved = {}
-    for command in reply["commands"]:
-        achieved[command["channel"]] = {name: command[name] for name in TONE}
-    commands = []
-    for tone in layer.commands:
-        got = achieved.get(tone.channel, {"level": 0})
-        error = abs(got.get("frequency", tone.frequency) - tone.frequency)
-        is_any = not tone.level and error > can["frequency_step"]
-        commands.append(tone if is_any else replace(tone, **got))
-    return replace(layer, commands=tuple(commands))
-
-
-def _rounding(name: str, tone: Command, can: Values) -> float:
-    """Return by how much a part of a tone may be rounded: inwards at the limits."""
-    step = can.get(f"{name}_step", 1)
-    if name != "phase" and can:
-        value = getattr(tone, name)
-        limits = can["limits"][tone.channel]
-        low = limits.get(f"{name}_min", 0)
-        high = limits[f"{name}_max"]
-        if not low <= value - step / 2 <= value + step / 2 <= high:
-            return float(step)
-    return float(step / 2)
+    def _collected_of(self, last: Values) -> dict[int, list[int]]:
+        """Return the collected parts of the set with this last part, by index."""
+        return self.collected if last["token"] == self.token else {}

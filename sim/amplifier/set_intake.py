@@ -59,11 +59,11 @@ class SetIntake:
             if not is_newer_token(token, older):
                 raise Refusal(f"token must be newer than {older}, got {token}", "BAD_TOKEN")
         self._check_numbers(part, is_under_way=is_under_way)
-        stream = self._parts.whole(part)
-        if isinstance(stream, int):
-            return TakenSet(missing=stream)
+        missing = self._parts.first_missing(part)
+        if missing is not None:
+            return TakenSet(missing=missing)
         try:
-            layers = self._checked(stream)
+            layers = self._checked(self._parts.stream(part))
         except Refusal:
             if is_under_way:
                 self.drop()

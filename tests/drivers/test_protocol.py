@@ -301,7 +301,8 @@ def test_set_is_whole_whatever_the_order_of_its_parts() -> None:
     for order in permutations(others):
         assembly = Assembly()
         assert [assembly.keep(part, 0.1) for part in (*order, order[0])] == [True] * 3
-        assert assembly.whole(last) == stream
+        assert assembly.first_missing(last) is None
+        assert assembly.stream(last) == stream
 
 
 def test_parts_of_another_set_or_too_late_are_not_mixed() -> None:
@@ -310,13 +311,13 @@ def test_parts_of_another_set_or_too_late_are_not_mixed() -> None:
     assembly = Assembly()
     assert assembly.keep(old[0], 0.0)
     assert assembly.keep(new[1], 0.1)
-    assert assembly.whole(new[2]) == 0
+    assert assembly.first_missing(new[2]) == 0
     assert assembly.keep(new[0], 0.1 + STAGED_LIFE + 0.01)
-    assert assembly.whole(new[2]) == 1
+    assert assembly.first_missing(new[2]) == 1
     assert not assembly.keep({**new[1], "parts": 4}, 1.2)
     assert assembly.keep(new[1], 0.2 + STAGED_LIFE)
-    assert assembly.whole(new[2]) == [2] * 300
-    assert assembly.whole(old[2]) == 0
+    assert assembly.stream(new[2]) == [2] * 300
+    assert assembly.first_missing(old[2]) == 0
 
 
 def test_damaged_streams_are_read_or_refused() -> None:

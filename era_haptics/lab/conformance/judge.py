@@ -3,8 +3,9 @@
 from dataclasses import replace
 from functools import partial
 
+from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem
+from drivers.protocol.sets import LayerSet
 from era_haptics.lab.conformance.outcomes import ContractViolation, require_in_time
 from era_haptics.lab.expectations.expected_amplifier import ExpectedAmplifier
 from era_haptics.lab.expectations.tolerances import Interval

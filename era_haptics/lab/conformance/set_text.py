@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 
+from drivers.protocol.achieved import FLAGS
 from drivers.protocol.definition import MESSAGES, QUANTITIES
 from drivers.protocol.records import Refusal
-from drivers.protocol.sets import FLAGS, Command, Envelope, LayerSet, unpack_layers
+from drivers.protocol.sets import Command, Envelope, LayerSet, unpack_layers
 
 _TONE_FORMATS = {"frequency": "{:g} Hz", "level": "{:g}", "phase": "at {:g} degrees"}
 

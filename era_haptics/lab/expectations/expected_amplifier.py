@@ -8,6 +8,7 @@ status.
 import math
 from typing import NamedTuple
 
+from drivers.protocol.achieved import FLAGS, TONE, AchievedProblem, achieved_problem
 from drivers.protocol.definition import (
     ENABLED,
     FAULTS,
@@ -19,15 +20,7 @@ from drivers.protocol.definition import (
     name_of,
 )
 from drivers.protocol.records import Values
-from drivers.protocol.sets import (
-    FLAGS,
-    TONE,
-    LayerSet,
-    Problem,
-    achieved_problem,
-    is_newer_token,
-    token_after,
-)
+from drivers.protocol.sets import LayerSet, is_newer_token, token_after
 from era_haptics.lab.expectations.expected_clock import ExpectedClock
 from era_haptics.lab.expectations.expected_faults import ExpectedFaults
 from era_haptics.lab.expectations.expected_outputs import ExpectedOutputs
@@ -553,18 +546,25 @@ class ExpectedAmplifier:
             return
         problem = self._achieved_problem(layer, reply, sure_layers)
         if problem is not None:
-            rule, name, expected, actual = problem
             report = self.report if reply["commands"] else self.report_silence
-            quantity = f"{name} of achieved layer {layer}"
-            report(rule, when.latest, quantity, expected=expected, actual=actual)
+            quantity = f"{problem.quantity} of achieved layer {layer}"
+            report(
+                problem.rule,
+                when.latest,
+                quantity,
+                expected=problem.required,
+                actual=problem.received,
+            )
 
-    def _achieved_problem(self, layer: int, reply: Values, sure_layers: set[int]) -> Problem | None:
+    def _achieved_problem(
+        self, layer: int, reply: Values, sure_layers: set[int]
+    ) -> AchievedProblem | None:
         """Return the first difference between a reply to GetAchieved and the commands of a
         layer."""
         outputs = self.outputs
         possible_tokens = outputs.tokens_of(layer, sure_layers)
         if reply["token"] not in possible_tokens:
-            return "token", "token", alternatives(possible_tokens), reply["token"]
+            return AchievedProblem("token", "token", alternatives(possible_tokens), reply["token"])
         if layer not in sure_layers:
             return None
         problem = achieved_problem(
@@ -579,12 +579,12 @@ class ExpectedAmplifier:
         rows = (reply, *reply["commands"])
         flags = [name for row in rows for name in FLAGS if row.get(name)]
         if flags:
-            return "plays", "flags", [], flags
+            return AchievedProblem("plays", "flags", [], flags)
         lasting = outputs.lasting.get(layer, {0}) if reply["commands"] else {0}
         if reply["valid_for"] not in lasting:
-            return "plays", "valid_for", sorted(lasting), reply["valid_for"]
+            return AchievedProblem("plays", "valid_for", sorted(lasting), reply["valid_for"])
         if reply["ramp"] and not reply["commands"]:
-            return "plays", "ramp of a silent layer", 0, reply["ramp"]
+            return AchievedProblem("plays", "ramp of a silent layer", 0, reply["ramp"])
         return None
 
     def report_silence(

@@ -47,11 +47,10 @@ class ExpectedSet:
 
     def sent(self, last: Values) -> str:
         """Record that the last part of a set was sent; returns its error, or ""."""
-        stream = self._parts.whole(last)
-        if isinstance(stream, int):  # the number of a missing part
+        if self._parts.first_missing(last) is not None:
             return ""
         try:
-            self._whole_layers = unpack_layers(stream)
+            self._whole_layers = unpack_layers(self._parts.stream(last))
         except Refusal as refusal:
             return str(refusal)
         self._whole_token = last["token"]
@@ -67,7 +66,7 @@ class ExpectedSet:
         is_unclear = self._is_unclear
         is_collected = last["token"] == self._parts.token
         is_repeated = is_collected and self.staged != 0
-        stream = [] if is_repeated else self._parts.whole(last)
+        missing = None if is_repeated else self._parts.first_missing(last)
         if reply["staged"] or reply["played"]:
             self._note_whole(last, reply, when)
         elif is_collected:
@@ -75,8 +74,8 @@ class ExpectedSet:
             self._parts.collected.pop(reply["missing"], None)
         if is_unclear:
             return None
-        if isinstance(stream, int):
-            return stream, 0, 0
+        if missing is not None:
+            return missing, 0, 0
         return 0, 1 - last["now"], last["now"]
 
     def _note_whole(self, last: Values, reply: Values, when: Interval) -> None:
@@ -96,7 +95,8 @@ class ExpectedSet:
         """Record that a last part was rejected, and with it the set if all other parts arrived."""
         is_collected = last["token"] == self._parts.token and not self.staged
         has_valid_index = last["index"] < last["parts"] == self._parts.count
-        if is_collected and has_valid_index and not isinstance(self._parts.whole(last), int):
+        is_whole = self._parts.first_missing(last) is None
+        if is_collected and has_valid_index and is_whole:
             self.drop()
 
     # Whole sets

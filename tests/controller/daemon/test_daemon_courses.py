@@ -271,7 +271,7 @@ class Served(Taken):
         supervisor = self.bench.daemon.supervisor
         assert supervisor.operation.lease is not None
         lease = replace(supervisor.operation.lease, expires_at=0.0)
-        supervisor.operation = replace(supervisor.operation, lease=lease)
+        supervisor.current.value = replace(supervisor.operation, lease=lease)
 
     async def uses(self) -> None:
         """Arm as the other client for a minute, which is never reached."""

@@ -19,9 +19,10 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import PORT_OPENER
+from drivers.protocol.achieved import achieved_problem
 from drivers.protocol.definition import MESSAGES, REPLY_TIMEOUT
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet, achieved_problem
+from drivers.protocol.sets import Command, LayerSet
 from drivers.wires.can_frames import unpack_frames
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
@@ -89,7 +90,7 @@ def test_half_a_step_and_what_the_wire_rounds_is_no_contradiction(played: Comman
 def test_more_than_that_is_one(name: str) -> None:
     """Of frequency, level and phase, and channels that are missing or too many."""
     problem = achieved_problem(SENT, shown(*OTHER[name]), CAN, is_exact=False, slack=0.5)
-    assert name in problem[1]
+    assert name in problem.quantity
 
 
 def test_channels_of_one_level_are_scaled_alike() -> None:
@@ -100,7 +101,7 @@ def test_channels_of_one_level_are_scaled_alike() -> None:
     limits = {"is_exact": False, "can_scale": True}
     assert achieved_problem(layer, shown(*halves), CAN, **limits) is None
     problem = achieved_problem(layer, shown(halves[0], tones[1]), CAN, **limits)
-    assert problem[1] == "shares of its channels"
+    assert problem.quantity == "shares of its channels"
 
 
 @pytest.mark.parametrize("kind", KINDS)

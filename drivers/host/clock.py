@@ -19,7 +19,7 @@ from drivers.host.clock_readings import (
     MAX_CRYSTAL,
     SIGNIFICANT,
     ClockReadings,
-    Verdict,
+    ReadingVerdict,
 )
 from drivers.host.clock_steering import (
     MAX_CLOCK_RATE,
@@ -408,14 +408,14 @@ class HeldClock:
             clock_error=self._max_reading_error,
         )
         match verdict:
-            case Verdict.DOUBTFUL:
+            case ReadingVerdict.DOUBTFUL:
                 return lead
-            case Verdict.JUMPED:
+            case ReadingVerdict.JUMPED:
                 if is_reported:
                     self._jumped_at = time
                 self._forget(time)
                 lead = math.remainder(shown_lead, CLOCK_TURN)
-            case Verdict.BELOW_FIT:
+            case ReadingVerdict.BELOW_FIT:
                 readings.lower(off)
         readings.add(Reading(time, lead, max_delay))
         return lead

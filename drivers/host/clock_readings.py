@@ -51,7 +51,7 @@ _TOO_FAST = 1e-3
 """Tolerance [s] of a clock's gain beyond its crystal, due to reading errors."""
 
 
-class Verdict(Enum):
+class ReadingVerdict(Enum):
     """What a reading shows, compared with the readings before it."""
 
     PLAUSIBLE = auto()
@@ -117,7 +117,7 @@ class ClockReadings:
         max_delay: float,
         error: float,
         clock_error: float,
-    ) -> Verdict:
+    ) -> ReadingVerdict:
         """Compare a reading at a time [s] with the earlier ones, and note if it is doubtful.
 
         off: its distance from the fit [s]. max_early, max_delay: by how much the request may have
@@ -131,11 +131,11 @@ class ClockReadings:
         is_late = off > max_delay + far or off > max_delay + highest - expected + _TOO_FAST
         self.is_doubted = is_early and not self.is_doubted
         if self.is_doubted:
-            return Verdict.DOUBTFUL
+            return ReadingVerdict.DOUBTFUL
         if is_early or is_late:
-            return Verdict.JUMPED
+            return ReadingVerdict.JUMPED
         is_below = off < -FAR - SIGNIFICANT * error
-        return Verdict.BELOW_FIT if is_below else Verdict.PLAUSIBLE
+        return ReadingVerdict.BELOW_FIT if is_below else ReadingVerdict.PLAUSIBLE
 
     def _possible_leads(self, time: float) -> tuple[float, float]:
         """Return the lowest and the highest lead [s] at a time [s] that kept readings allow.

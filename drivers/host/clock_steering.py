@@ -19,7 +19,7 @@ MAX_CLOCK_RATE = 2e-4
 _PER_RATE = QUANTITIES["rate"].per_unit
 
 
-class _Speed(NamedTuple):
+class _SteeringLimit(NamedTuple):
     """How fast a lead is steered to zero."""
 
     time: float
@@ -32,11 +32,11 @@ class _Speed(NamedTuple):
         return -_limited(lead / self.time, self.max_rate)
 
 
-_GENTLE = _Speed(0.5, 1e-4)
+_GENTLE = _SteeringLimit(0.5, 1e-4)
 """While something plays: the rate is not felt."""
-_FAST = _Speed(0.2, 2.8e-3)
+_FAST = _SteeringLimit(0.2, 2.8e-3)
 """While nothing plays: four Pings, since lost ones would overshoot; the highest rate of a Ping."""
-_COMMON = _Speed(0.5, 5e-4)
+_COMMON = _SteeringLimit(0.5, 5e-4)
 """For the lead that all clocks of a line share. Their Pings are sequential: with a higher rate the
 clocks would diverge."""
 MAX_COMMON_RATE = _COMMON.max_rate
@@ -57,8 +57,8 @@ def rate_against(
     the host's. crystal_rate: rate of its crystal, which is cancelled. is_gentle: whether the rate
     must not be felt.
     """
-    speed = _GENTLE if is_gentle else _FAST
-    steering = _COMMON.rate(common_lead) + speed.rate(own_lead)
+    limit = _GENTLE if is_gentle else _FAST
+    steering = _COMMON.rate(common_lead) + limit.rate(own_lead)
     crystal = _limited(crystal_rate, MAX_CLOCK_RATE)
     return round((_limited(steering, _FAST.max_rate) - crystal) * _PER_RATE)
 

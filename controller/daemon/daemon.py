@@ -30,7 +30,8 @@ from controller.daemon.reload import ConfigReload
 from controller.gateway.gateway_settings import require_gateway
 from controller.operation.operation_states import ENERGISED, Operation
 from controller.operation.plate_controller import Controller
-from controller.operation.supervisor import LinkChange, Supervisor
+from controller.operation.reopening import LinkChange
+from controller.operation.supervisor import Supervisor
 from controller.play.reports import Observers
 from controller.process.daemon_process import (
     MIN_DESCRIPTORS,

@@ -32,8 +32,9 @@ from benchmarks.promise.cases import (
 from benchmarks.promise.hearing import Heard, Log, Span, owner_of
 from benchmarks.setting import random_contacts
 from controller.effects.player import CLICK_ABOVE_DB
-from controller.play.intent import FingerSensation, HapticIntent, Pulse, Target
+from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.reports import PlayReport
+from controller.play.selected_contents import FingerSensation
 from controller.sources.touch import ContactKey
 from kit.chain import Chain
 from kit.clock import run_virtual

@@ -6,9 +6,10 @@ from typing import Any
 
 from controller.api.methods import ContactsEvent, PatternEvent, SilenceEvent
 from controller.api.schema import ContactStatus, PlayedTone
-from controller.play.intent import BEING_CHOSEN, NO_CONTACTS, FingerSensation, leaks_db_sl
+from controller.play.intent import NO_CONTACTS
 from controller.play.reports import PlayReport
 from controller.play.routing import Drive
+from controller.play.selected_contents import BEING_CHOSEN, FingerSensation, leaks_db_sl
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import is_felt
 from model.table.table import LocalizationTable

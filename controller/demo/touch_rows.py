@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, TypeAlias
 
 from controller.demo.simulated_plate import FingerVibration
-from controller.play.intent import FingerSensation
 from controller.play.reports import PlayReport
+from controller.play.selected_contents import FingerSensation
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Layer
 from model.arrays import Point

@@ -16,22 +16,14 @@ from functools import partial
 from typing import TypeAlias
 
 from controller.play.crossfades import Crossfades
-from controller.play.intent import (
-    TIME_LIMIT,
-    Content,
-    ContentKey,
-    FingerTarget,
-    Question,
-    Selection,
-    Target,
-    Targets,
-)
+from controller.play.intent import FingerTarget, Target, Targets
 from controller.play.joint_answers import (
     LIMITS_LEAVE_NOTHING,
     Shape,
     answered,
     selection_of,
 )
+from controller.play.selected_contents import TIME_LIMIT, Content, ContentKey, Question, Selection
 from controller.play.shared_capabilities import PlaybackCapabilities
 from model.answer.adjustments import scaled
 from model.answer.answer import APART_HZ, Answer

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.play.intent import FADED_AFTER, NOTHING, Content, Question, Selection
+from controller.play.intent import FADED_AFTER
 from controller.play.joint_answers import SHORT_OF, Shape, answered, selection_of
 from controller.play.layers import CROSSFADE, FALL_AFTER
+from controller.play.selected_contents import NOTHING, Content, Question, Selection
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import ContactKey
 from model.answer.answer import APART_HZ, SAME_LEVEL, Answer

@@ -23,16 +23,18 @@ import numpy as np
 
 from controller.play.intent import (
     MAX_DB_SL,
-    Content,
-    ContentKey,
-    FingerSensation,
     FingerTarget,
-    Question,
-    Selection,
     Target,
     Targets,
     band_of_table,
     contacts_of,
+)
+from controller.play.selected_contents import (
+    Content,
+    ContentKey,
+    FingerSensation,
+    Question,
+    Selection,
     judged,
     not_served,
     own_level_db_sl,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from controller.play.intent import Content, Pulse
+from controller.play.intent import Pulse
 from controller.play.layers import CROSSFADE, MIN_LEFT, MIN_VALID_FOR, Slot
 from controller.play.routing import (
     BESIDE_CLICK,
@@ -25,6 +25,7 @@ from controller.play.routing import (
     route,
     thinned,
 )
+from controller.play.selected_contents import Content
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.playing import AmplifierLayer

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Self
 
-from controller.play.intent import CLICK, Content, ContentKey
+from controller.play.intent import CLICK
 from controller.play.routing import Drive
+from controller.play.selected_contents import Content, ContentKey
 from drivers.playing import AmplifierTone
 from model.answer import answer
 

@@ -15,9 +15,10 @@ from functools import partial
 
 from controller.play.chooser import Chooser
 from controller.play.counted_clocks import CountedClocks
-from controller.play.intent import Content, IntentSource, Pulse, Selection, no_layer_free
+from controller.play.intent import IntentSource, Pulse
 from controller.play.layer_sets import Sets
 from controller.play.layers import Slot
+from controller.play.selected_contents import Content, Selection, no_layer_free
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slots import RELEASE_RAMP, RETRY, Check, Slots

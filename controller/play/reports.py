@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from controller.play.intent import FingerSensation, Selection, not_served
 from controller.play.layers import Slot
 from controller.play.planner import Plan
 from controller.play.routing import Drive
+from controller.play.selected_contents import FingerSensation, Selection, not_served
 from controller.sources.touch import Change, Contact, ContactKey
 from model.answer.answer import Layer
 

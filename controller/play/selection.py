@@ -13,24 +13,20 @@ from typing import NamedTuple
 
 from controller.play.chooser import ChoiceThread, Chooser, contents_of
 from controller.play.crossfades import RESTS_AFTER, Improvement, is_due
-from controller.play.intent import (
+from controller.play.intent import FADED_AFTER, FingerTarget, HapticIntent, Target, Targets
+from controller.play.joint_answers import STRETCH
+from controller.play.selected_contents import (
     BEING_CHOSEN,
-    FADED_AFTER,
     NOTHING,
     Content,
     ContentKey,
     FingerSensation,
-    FingerTarget,
-    HapticIntent,
     Question,
     Selection,
-    Target,
-    Targets,
     foreign_at,
     no_layer_free,
     not_served,
 )
-from controller.play.joint_answers import STRETCH
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.plan import MAX_SEPARATE

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from controller.play.intent import FADED_AFTER, Content
+from controller.play.intent import FADED_AFTER
 from controller.play.layer_sets import SetBuilder, Sets
 from controller.play.layers import LayerAllocation, Slot, SlotPhase, settling_time
 from controller.play.routing import (
@@ -20,6 +20,7 @@ from controller.play.routing import (
     full_drive,
     tones_by_era,
 )
+from controller.play.selected_contents import Content
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import ContactKey
 from drivers.errors import CommandRefused

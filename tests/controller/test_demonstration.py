@@ -27,8 +27,8 @@ from controller.demo.demonstration import (
 from controller.demo.recorder import TouchRecorder
 from controller.demo.simulated_plate import FingerVibration, SimulatedPlate, simulated_plate
 from controller.demo.touch_rows import FingerRow, TouchRow, steady_contrast_db
-from controller.play.intent import not_served
 from controller.play.reports import Observers, PlayReport
+from controller.play.selected_contents import not_served
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
 from controller.sources.tuio import TuioSource
 from drivers.errors import LinkError

@@ -26,7 +26,7 @@ import pytest
 
 from cases import shortly
 from controller.api.client import AsyncClient
-from controller.play.intent import GIVEN_UP
+from controller.play.selected_contents import GIVEN_UP
 from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
 from kills import PLACES as KILLED_AT

@@ -11,8 +11,9 @@ from controller.effects.effect import ON_RELEASE, Effect, EffectStimulus, Region
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
 from controller.play.chooser import Chooser
-from controller.play.intent import FingerTarget, Question, Target, band_problem
+from controller.play.intent import FingerTarget, Target, band_problem
 from controller.play.joint_answers import answered
+from controller.play.selected_contents import Question
 from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer, Limits

@@ -17,8 +17,9 @@ from matplotlib.patheffects import withStroke
 
 from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
-from controller.play.intent import FingerTarget, Question, Selection, Target
+from controller.play.intent import FingerTarget, Target
 from controller.play.joint_answers import fingers_of, selection_of
+from controller.play.selected_contents import Question, Selection
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks.layout_check import (
     CheckedEffect,

@@ -22,17 +22,9 @@ from controller.daemon.plate_view import PlateView
 from controller.effects.file_effect import File
 from controller.effects.layout import SurfaceLayout, layout_of
 from controller.play.chooser import Chooser
-from controller.play.intent import (
-    CLICK,
-    Content,
-    ContentKey,
-    FingerTarget,
-    HapticIntent,
-    Pulse,
-    Selection,
-    Target,
-)
+from controller.play.intent import CLICK, FingerTarget, HapticIntent, Pulse, Target
 from controller.play.layers import CROSSFADE, LayerAllocation, Slot, SlotPhase
+from controller.play.selected_contents import Content, ContentKey, Selection
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slots import Slots

@@ -27,17 +27,9 @@ from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.operation.plate_controller import Controller
 from controller.play.chooser import Chooser
-from controller.play.intent import (
-    HapticIntent,
-    Pulse,
-    Selection,
-    Target,
-    beside_others,
-    judged,
-    sums_db,
-    weakened,
-)
+from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.reports import PlayReport
+from controller.play.selected_contents import Selection, beside_others, judged, sums_db, weakened
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.contact_tracker import ContactTracker

@@ -18,8 +18,8 @@ import pytest
 
 from controller.effects.player import EffectPlayer
 from controller.play.counted_clocks import CountedClocks
-from controller.play.intent import leaks_db_sl
 from controller.play.routing import on_wire, route, thinned
+from controller.play.selected_contents import leaks_db_sl
 from controller.play.shared_capabilities import (
     EnvelopeSupport,
     envelope_support,

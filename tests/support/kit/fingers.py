@@ -29,19 +29,17 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.operation.supervisor import Supervisor
-from controller.play.intent import (
-    CLICK,
-    Content,
-    ContentKey,
-    FingerSensation,
-    FingerTarget,
-    Question,
-    Selection,
-    Target,
-)
+from controller.play.intent import CLICK, FingerTarget, Target
 from controller.play.joint_answers import answered, selection_of
 from controller.play.layer_sets import Sets
 from controller.play.reports import PlayReport
+from controller.play.selected_contents import (
+    Content,
+    ContentKey,
+    FingerSensation,
+    Question,
+    Selection,
+)
 from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.slots import Slots
 from controller.sources.touch import Contact, Touch, TouchFrame

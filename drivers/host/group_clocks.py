@@ -18,8 +18,9 @@ from drivers.errors import DriverError
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import HeldClock
 from drivers.host.joint_sets import JointSets
-from drivers.host.line import GRACE, Line
+from drivers.host.line import Line
 from drivers.host.members import Members
+from drivers.host.reply_timing import GRACE
 from drivers.host.requests import Priority
 from drivers.protocol.definition import HEARTBEAT, has_feature
 

@@ -16,8 +16,9 @@ from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.group_clocks import Clocks
 from drivers.host.joint_sets import JointSets, commit_of, word_passed_by_all
-from drivers.host.line import GRACE, Line
+from drivers.host.line import Line
 from drivers.host.members import Members, is_lost
+from drivers.host.reply_timing import GRACE
 from drivers.host.requests import Make, Priority
 from drivers.protocol.definition import HEARTBEAT, REQUESTS
 from drivers.protocol.records import Values

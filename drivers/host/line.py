@@ -5,15 +5,14 @@
 when its turn comes, so that they are checked once, against the requests really sent before.
 
 An `Attempt` is the transmission of one message and the wait for its reply. It ends with a reply, at
-its deadline, or earlier if a more urgent request waits. A request without a reply is repeated. The
-parts of a set are sent without a pause; only the last part has a reply, and only missing parts are
-repeated. On Modbus a message is a write and a read, and each part of a set is confirmed. Times [s]
-refer to the event loop's clock.
+its deadline, or earlier if a more urgent request waits (`drivers.host.reply_timing`). A request
+without a reply is repeated. The parts of a set are sent without a pause; only the last part has a
+reply, and only missing parts are repeated. On Modbus a message is a write and a read, and each part
+of a set is confirmed. Times [s] refer to the event loop's clock.
 """
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 from drivers import trace
@@ -25,14 +24,13 @@ from drivers.errors import (
     no_reply,
     refused_by_amplifier,
 )
-from drivers.host.requests import Job, JobQueue, Make, Member, Priority, ReplyWait
+from drivers.host.reply_timing import Attempt, AttemptPhase, ReplyTiming
+from drivers.host.requests import Job, JobQueue, Make, Member, Priority
 from drivers.ports import OpenPort
 from drivers.protocol.definition import (
     ATTEMPTS,
     BROADCAST,
-    FAST,
     MESSAGES,
-    REACTION,
     REPLY_TIMEOUT,
 )
 from drivers.protocol.records import Values
@@ -50,45 +48,9 @@ from drivers.wires.wire import (
     WrittenPart,
 )
 
-GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request is repeated to a busy amplifier
-_AHEAD = 0.005  # s; lead for writing the next part of a set; a stop waits for bytes already sent
-_FULL_PAUSE = 0.0005  # s; before checking a blocked port again
 _LOOK_INTERVAL = 0.01  # s; between checks; each check would detect a delay of this process
-_LATE = 0.005  # s; if a timer fires later than this, this process was delayed
-_MAX_LATE = 0.032
-"""Maximum extra time [s] to await a reply after late replies.
-
-An adapter can delay data by 16 ms in each direction.
-"""
-_LATE_DECAY = 0.9  # of the lateness of replies, with each reply
-_MAX_COMMIT_LATE = 0.003  # s; one frame of full-speed USB, 1 ms, for each of port, hub and adapter
-_SENDING = 0.0005  # s; this process needs it to write to all lines
-_DELAYS = 4  # delays of this process that prolong the wait for one reply
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
-
-
-@dataclass(eq=False, slots=True)
-class Attempt:
-    """The transmission of one message of a request, and the wait for its reply."""
-
-    job: Job
-    member: Member
-    """The amplifier that it is for."""
-    takes: float
-    """Duration of request and reply on the wire [s]."""
-    sent_at: float
-    """When its first bytes were written to the port [s]."""
-    started_at: float
-    """When its first bit was on the wire [s], after earlier requests."""
-    is_followed: bool
-    """Whether the next part is sent without a reply to this message."""
-    due: float = 0.0
-    """Deadline of the reply [s]."""
-    delays: int = 0
-    """How often this process was delayed while the reply was awaited."""
-    is_last_look: bool = False
-    """Whether the port was read once more after the reply had become due."""
 
 
 class Line:
@@ -126,17 +88,15 @@ class Line:
         """Until when Hello is repeated [s] if no amplifier has replied."""
         self._has_replied = False
         """Whether an amplifier has replied since the port was opened."""
-        self._is_pumping = False
-        """Whether `pump` is running, which must not call itself."""
-        self._sent_until = 0.0
-        """Until when sent bytes are still under way [s]."""
-        self._free_at = 0.0
-        """Until when a reply may still occupy the line [s]."""
-        self.late = 0.0
-        """Delay of replies [s] beyond the time on the wire, at most `_MAX_LATE`."""
+        self._is_sending = False
+        """Whether messages are being sent; requests that are submitted meanwhile are queued."""
+        self._timing = ReplyTiming()
 
     def open(self, port: OpenPort) -> None:
-        """Use this open port from now on."""
+        """Use this open port, once: a lost line is not opened again.
+
+        If the port was lost meanwhile, the line stays lost.
+        """
         self._port = port
         self._commit_takes = self.wire.transit(MESSAGES["Commit"].request.words)
         self._boots_until = self.time() + self._boot_time
@@ -146,6 +106,11 @@ class Line:
     def current(self) -> Job | None:
         """The request on the line; None if the line is free."""
         return None if self._attempt is None else self._attempt.job
+
+    @property
+    def late(self) -> float:
+        """Delay of replies [s] beyond the time on the wire."""
+        return self._timing.late
 
     def submit(
         self,
@@ -173,8 +138,8 @@ class Line:
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
             return future
-        if self._attempt is None and not (self._queue or self._is_pumping):
-            self._start(job)
+        if self._attempt is None and not (self._queue or self._is_sending):
+            self._send_from(job)
             return future
         for obsolete in self._queue.superseded_by(priority, member):
             self._fail(obsolete, Preempted(SUPERSEDED))
@@ -190,9 +155,7 @@ class Line:
         It may be as late as replies have been, but by three frames of USB at the most. The time of
         a repetition is not included: a lost commit is repeated 30 ms later.
         """
-        begins = max(self.time(), self._free_at, self._sent_until)
-        late = min(self.late, _MAX_COMMIT_LATE) + _SENDING
-        return begins + self._commit_takes + late
+        return self._timing.commit_arrives(self.time(), self._commit_takes)
 
     def received(self, data: bytes) -> None:
         """Process bytes that the port has received."""
@@ -201,9 +164,8 @@ class Line:
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
         for arrival in arrivals:
             self._process(arrival)
-        if self._queue:
-            self.pump()
-        elif self._attempt is None and self._timer is not None:
+        self.pump()
+        if self._attempt is None and self._timer is not None:
             self._timer.cancel()  # no reply is due
             self._timer = None
 
@@ -217,21 +179,20 @@ class Line:
         attempt = self._attempt
         if attempt is None:
             return
-        self._sent_until = 0.0  # a request with a reply has arrived
+        self._timing.note_arrived()
         if isinstance(arrival, Continuation):
-            self.late = max(self.late, min(self.time() - self._free_at, _MAX_LATE))
+            self._timing.note_continuation(self.time())
             if self._must_yield(attempt.job):
                 self._end_without_reply(attempt)
             else:
                 self._continue(attempt, arrival.data, is_present=arrival.is_present)
             return
-        self._attempt = None
         attempt.member.no_reply_cause = None
         if isinstance(arrival, WrittenPart):
-            self._go_on(attempt.job)
+            attempt.phase = AttemptPhase.CONFIRMED
             return
-        late = self.time() - attempt.started_at - attempt.takes
-        self.late = min(max(late, self.late * _LATE_DECAY), _MAX_LATE)
+        self._attempt = None
+        self._timing.note_reply(attempt, self.time())
         if isinstance(arrival, Reply):
             self._has_replied = True
             self._end_with_reply(attempt, arrival.values)
@@ -270,25 +231,68 @@ class Line:
             self._timer.cancel()
 
     def pump(self) -> None:
-        """Send the next request if the line is free."""
-        if self._is_pumping:
-            return
-        self._is_pumping = True
+        """Send the next part of the set on the line, or the next request if the line is free."""
+        if not self._is_sending:
+            self._send_from(self._next_job())
+
+    def _send_from(self, job: Job | None) -> None:
+        """Send a message of a request, and then the next messages until one must wait."""
+        self._is_sending = True
         try:
-            while self.loss is None and self._attempt is None and self._queue:
-                job = self._queue.next(self.time())
-                if job is None:
-                    break
-                self._queue.take(job, self.time())
-                if job.result.done():
-                    self._fail(job, Preempted(SUPERSEDED))  # its caller was cancelled
-                else:
-                    self._start(job)
+            while job is not None:
+                self._start(job)
+                job = self._next_job()
         finally:
-            self._is_pumping = False
+            self._is_sending = False
+
+    def _next_job(self) -> Job | None:
+        """Take the request that sends a message now; None while the line is busy or nothing waits.
+
+        After a part of a set, this is the same request, unless a waiting one goes before it.
+        """
+        if self.loss is not None:
+            return None
+        attempt = self._attempt
+        if attempt is None:
+            return self._take_queued()
+        if not self._is_followed_now(attempt):
+            return None
+        self._attempt = None
+        job = attempt.job
+        job.go_on()
+        if self.wire.confirms_parts:
+            job.reach(job.part)
+        if not self._queue.has_before(job, self.time()):
+            return job
+        self._queue_again(job)
+        return self._take_queued()
+
+    def _is_followed_now(self, attempt: Attempt) -> bool:
+        """Whether the next part of the set on the line is sent now; else a timer waits for it."""
+        if attempt.phase is not AttemptPhase.NEXT_PART:
+            return attempt.phase is AttemptPhase.CONFIRMED
+        now = self.time()
+        due = self._timing.next_part_due(now, is_blocked=self._port.is_blocked)
+        if due <= now or self._queue.has_before(attempt.job, now):
+            return True
+        self._look_by(due)
+        return False
+
+    def _take_queued(self) -> Job | None:
+        """Take the next request from the queue; None if there is none, or it is pausing."""
+        while self._queue:
+            now = self.time()
+            job = self._queue.next(now)
+            if job is None:
+                return None
+            self._queue.take(job, now)
+            if not job.result.done():
+                return job
+            self._fail(job, Preempted(SUPERSEDED))  # its caller was cancelled
+        return None
 
     def _start(self, job: Job) -> None:
-        """Send a request and await its reply, or fail it if it cannot be sent."""
+        """Send a message of a request and await its reply, or fail it if it cannot be sent."""
         try:
             self._send_ahead(job)
             attempt = self._send(job)
@@ -329,7 +333,7 @@ class Line:
         has_reply = member is not None and not job.has_further_parts
         data = self.wire.request(address, job.name, job.values, has_reply=has_reply)
         now = self.time()
-        begins = max(now, self._sent_until)  # after bytes still under way
+        begins = self._timing.begins(now)
         for receiver in self.members.values():
             if address in (BROADCAST, receiver.address):
                 receiver.note_sent(job.name, job.values, now, begins + self.wire.takes)
@@ -337,7 +341,8 @@ class Line:
         if member is None:
             return None
         is_followed = job.has_further_parts and not self.wire.confirms_parts
-        return Attempt(job, member, takes, now, begins, is_followed)
+        phase = AttemptPhase.NEXT_PART if is_followed else AttemptPhase.REPLY
+        return Attempt(job, member, takes, now, begins, phase)
 
     def _continue(self, attempt: Attempt, data: bytes, *, is_present: bool) -> None:
         """Send the rest of a message, and await its reply.
@@ -347,13 +352,14 @@ class Line:
         job = attempt.job
         try:
             now = self.time()
-            begins = max(now, self._sent_until)
+            begins = self._timing.begins(now)
             if is_present:
                 attempt.member.note_sent(job.name, job.values, now, begins + self.wire.takes)
             self._write(job, data, begins)
         except Exception as error:  # every caller must get a result, after any failure
             self._fail_sending(job, error)
             return
+        attempt.phase = AttemptPhase.REPLY
         self._await_reply(attempt, now, begins)
 
     def _write(self, job: Job, data: bytes, begins: float) -> None:
@@ -362,8 +368,7 @@ class Line:
         if trace.is_active():
             request = job.name if member is None else f"{job.name} to {member.address}"
             trace.frame(Direction.OUT, data, self.name, lambda: request)
-        self._sent_until = begins + self.wire.takes
-        self._free_at = begins + self.wire.busy
+        self._timing.note_written(begins, self.wire)
         try:
             self._port.write(data)
         except LinkTimeout as error:  # the port accepts nothing: the amplifier is degraded
@@ -382,39 +387,12 @@ class Line:
     def _await_reply(self, attempt: Attempt, now: float, begins: float) -> None:
         """Await the reply to bytes that were written now [s] and are on the wire from a time [s].
 
-        If further parts of a set follow, send the next part instead.
+        If further parts of a set follow, there is no reply.
         """
-        # On Modbus each of the two responses may begin late.
-        late = self.late if self.late > GRACE else 0.0
-        slowness = max(attempt.takes - FAST, 0.0)
-        attempt.due = max(attempt.due, begins + slowness + attempt.job.timeout + late)
-        attempt.delays = 0
-        attempt.is_last_look = False
+        self._timing.set_deadline(attempt, begins)
         self._attempt = attempt
-        if attempt.is_followed:
-            self._send_further(attempt.job)
-        elif self._timer is None:
+        if attempt.phase is AttemptPhase.REPLY and self._timer is None:
             self._timer = self._loop.call_at(min(attempt.due, now + _LOOK_INTERVAL), self._look)
-
-    def _send_further(self, job: Job) -> None:
-        """Send the next part of a set once the last one has nearly arrived."""
-        now = self.time()
-        due = max(self._sent_until - _AHEAD, now + _FULL_PAUSE * self._port.is_blocked)
-        if due <= now or self._queue.has_before(job, now):
-            self._go_on(job)
-        else:
-            self._look_by(due)
-
-    def _go_on(self, job: Job) -> None:
-        """Send the next part of a set, unless a waiting request goes before it."""
-        self._attempt = None
-        job.go_on()
-        if self.wire.confirms_parts:
-            job.reach(job.part)
-        if self._queue.has_before(job, self.time()):
-            self._queue_again(job)
-        else:
-            self._start(job)
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request must yield to a request that silences."""
@@ -468,21 +446,9 @@ class Line:
     def _shorten(self, attempt: Attempt) -> None:
         """Await the current reply for less time if a more urgent request is waiting."""
         job = attempt.job
-        if job.is_stop_class:
+        if job.is_stop_class or attempt.phase is AttemptPhase.NEXT_PART:
             return
-        if attempt.is_followed:  # no reply is due
-            self._send_further(job)
-            return
-        free_at = max(self.time(), self._free_at)
-        match job.reply_wait(self._queue):
-            case ReplyWait.NONE:
-                attempt.due = min(attempt.due, free_at)
-            case ReplyWait.SHORT:
-                attempt.due = min(attempt.due, free_at + GRACE)
-            # Where replies come late, a reading that is cut short each time would never end.
-            case ReplyWait.UNTIL_START if self.late <= GRACE:
-                begins_by = max(attempt.started_at + attempt.takes, self._free_at) + REACTION
-                attempt.due = min(attempt.due, max(self.time(), begins_by))
+        self._timing.shorten(attempt, job.reply_wait(self._queue), self.time())
         self._look_by(attempt.due)
 
     def _look_by(self, due: float) -> None:
@@ -500,27 +466,14 @@ class Line:
         if attempt is None or timer is None:
             return
         now = self.time()
-        self._prolong_after_delay(attempt, timer.when(), now)
-        if now < attempt.due and attempt.is_followed:
-            self._send_further(attempt.job)
-            self.pump()
-        elif now >= attempt.due and self._is_unanswered(attempt, now):
+        must_yield = self._must_yield(attempt.job)
+        self._timing.prolong(attempt, timer.when(), now, must_yield=must_yield)
+        if now >= attempt.due and self._is_unanswered(attempt, now):
             self._end_without_reply(attempt)
-            self.pump()
-        else:
-            self._look_again()
-
-    def _prolong_after_delay(self, attempt: Attempt, timer_due: float, now: float) -> None:
-        """Prolong the wait for a reply if the timer, due at a time [s], has fired late.
-
-        This process was delayed by as much. The reply keeps the time that it had left when the
-        delay began, unless a stop is waiting.
-        """
-        delayed_since = max(timer_due, attempt.sent_at)
-        if now - delayed_since > _LATE and attempt.delays < _DELAYS:
-            attempt.delays += 1
-            left = 0.0 if self._must_yield(attempt.job) else attempt.due - delayed_since
-            attempt.due = now + max(left, _LATE)
+        self.pump()
+        if self._attempt is not None and self._timer is None:
+            due = min(self._attempt.due, self.time() + _LOOK_INTERVAL)
+            self._timer = self._loop.call_at(due, self._look)
 
     def _is_unanswered(self, attempt: Attempt, now: float) -> bool:
         """Read the port for a reply that is due, and return whether it has not come.
@@ -530,17 +483,11 @@ class Line:
         self._port.poll()
         if self._attempt is not attempt or self.time() < attempt.due:
             return False
-        if attempt.is_last_look:
+        if attempt.phase is not AttemptPhase.REPLY:  # read before, or there is no reply
             return True
         attempt.due = now
-        attempt.is_last_look = True
+        attempt.phase = AttemptPhase.LAST_LOOK
         return False
-
-    def _look_again(self) -> None:
-        """Look at the current attempt again when it is due, or earlier."""
-        if self._attempt is not None and self._timer is None:
-            due = min(self._attempt.due, self.time() + _LOOK_INTERVAL)
-            self._timer = self._loop.call_at(due, self._look)
 
     def _end_without_reply(self, attempt: Attempt) -> None:
         """Repeat the current request, which had no reply in time, or give it up."""

@@ -193,15 +193,15 @@ class Forms:
 
 def _powers(fields: Complex64Array, weights: Complex64Array) -> Float32Array:
     """Squared magnitudes (f, q, p) of fields (f, q, p, eras) for weights (f, eras)."""
-    found = np.matvec(fields, weights[:, None])
-    return np.asarray(found.real * found.real + found.imag * found.imag)
+    amplitudes = np.matvec(fields, weights[:, None])
+    return np.asarray(amplitudes.real * amplitudes.real + amplitudes.imag * amplitudes.imag)
 
 
 def _expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:
     """w^H R w of forms (q, f, eras, eras) and weights (..., f, eras): (..., q, f)."""
-    each = weights[..., None, :, :]
-    moved = np.matvec(forms, each)
-    return np.asarray(np.vecdot(each, moved).real)
+    by_form = weights[..., None, :, :]
+    products = np.matvec(forms, by_form)
+    return np.asarray(np.vecdot(by_form, products).real)
 
 
 LAWSON_STEPS = 3
@@ -278,15 +278,16 @@ class CoherentResult:
 
 def search(forms: Forms) -> CoherentResult:
     """Find the best weights at each frequency, brought within full stroke where necessary."""
-    found = search_all(forms)
+    result = search_all(forms)
     for method in WITHIN_STROKE:
-        open_ = found.level_limited
-        if len(open_) == 0:
+        limited = result.level_limited
+        if len(limited) == 0:
             break
-        more = tried(forms.at(open_), method)
-        found.score[open_], found.weights[open_] = more.score, more.weights
-        found.missed[open_] = np.maximum(found.missed[open_], more.missed)
-    return found
+        raised = search_by(forms.at(limited), method)
+        result.score[limited] = raised.score
+        result.weights[limited] = raised.weights
+        result.missed[limited] = np.maximum(result.missed[limited], raised.missed)
+    return result
 
 
 def search_to_level(forms: Forms) -> tuple[CoherentResult, Forms]:
@@ -294,72 +295,105 @@ def search_to_level(forms: Forms) -> tuple[CoherentResult, Forms]:
 
     Also return the forms with the level that was searched for.
     """
-    found = search(forms)
-    for is_highest in (False, True):
-        if found.score.any():
-            break
-        level = NEARLY_HIGHEST * max_sensation(forms) if is_highest else forms.wanted
-        forms = replace(forms, wanted=float(np.float32(level)), level_margin=0.0)
-        found = search(forms)
-    return found, forms
+    result = search(forms)
+    if not result.score.any():
+        forms = _without_margin(forms, forms.wanted)
+        result = search(forms)
+    if not result.score.any():
+        forms = _without_margin(forms, NEARLY_HIGHEST * max_sensation(forms))
+        result = search(forms)
+    return result, forms
+
+
+def _without_margin(forms: Forms, wanted: float) -> Forms:
+    """Return forms with another wanted level, in single precision, and without its margin."""
+    return replace(forms, wanted=float(np.float32(wanted)), level_margin=0.0)
 
 
 def search_all(forms: Forms) -> CoherentResult:
     """Find the best weights at every frequency, none raised to the level."""
-    return tried(forms, SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER)
+    return search_by(forms, SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER)
 
 
 def max_sensation(forms: Forms) -> float:
     """Return the highest amplitude to threshold that weights give the weakest target."""
     any_level = replace(forms, wanted=0.0, level_margin=0.0)
-    peak = forms.amplitude(tried(any_level, WITHIN_STROKE[-1]).weights)
+    loudest = search_by(any_level, WITHIN_STROKE[-1])
+    peak = forms.amplitude(loudest.weights)
     return float((peak / forms.threshold).max())
 
 
-def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
+def search_by(forms: Forms, method: LawsonMethod) -> CoherentResult:
     """Find the best of the weights of a method at every frequency.
 
-    Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are
-    zero but for ERAs at full stroke; they are multiplied by the squared magnitudes of the
-    weights until they fit.
+    Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are zero
+    but for ERAs at full stroke (`_raised`).
     """
     f, q, n, _ = forms.quiet.shape
     shares = np.full((f, q), 1 / q, dtype=np.float32)
     multipliers = limit = np.zeros((f, 1), dtype=np.float32)
     bound = np.full(f, np.inf, dtype=np.float32)
-    every_weights, powers, factors = [], [], None
+    weights_by_step = list[Complex64Array]()
+    power_by_step = list[Float32Array]()
+    factors = None
     for step in range(method.steps):
         R = _weighted(forms, shares)
         diagonal = R.reshape(f, -1)[:, :: n + 1]
         diagonal *= 1 + np.float32(method.variance)
         diagonal += multipliers
-        weights, highest, factors = _optimise_targets(R, forms.targets, factors, method.gain)
-        bound = np.minimum(bound, highest)
+        weights, bound_of_step, factors = _optimise_targets(R, forms.targets, factors, method.gain)
+        bound = np.minimum(bound, bound_of_step)
         if method.is_limited:
             gain = LEVEL_RESERVE * forms.gain_to_level(weights)
             weights = (weights * gain[:, None]).astype(np.complex64)
         fitting = _saturated(weights, method.gain) if method.gain else weights
-        expected = forms.quiet_power(fitting)
-        every_weights.append(fitting)
-        powers.append(np.maximum.reduce(expected, axis=1))
-        shares = _moved(shares, expected)
-        if not method.is_limited:
-            continue
-        power = np.abs(weights) ** 2
-        if step == 0:
-            own = np.maximum.reduce(forms.quiet_power(weights), axis=1)
-            multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _LEAST_POWER))[:, None]
-            limit = np.float32(MAX_MULTIPLIER) * multipliers
-        # If the level cannot be reached, they would grow without end.
-        multipliers = np.minimum(multipliers * np.minimum(power, MAX_GROWTH), limit)
-    every = np.array(every_weights)
-    peak, reaches = forms.reached(every)
-    each = peak / np.sqrt(np.maximum(powers, _LEAST_POWER) + _TINY * (peak * peak))
-    score = np.where(reaches, each, 0)
-    best = (best_along(score, axis=0), np.arange(f))
-    best_weights = np.where(score[best][:, None] > 0, every[best], 0).astype(np.complex64)
-    missed = np.maximum.reduce(np.where(reaches, 0, each), axis=0)
-    return CoherentResult(score[best], best_weights, bound, missed)
+        quiet_power = forms.quiet_power(fitting)
+        weights_by_step.append(fitting)
+        power_by_step.append(np.maximum.reduce(quiet_power, axis=1))
+        shares = _moved(shares, quiet_power)
+        if method.is_limited:
+            if step == 0:
+                multipliers = _first_multipliers(forms, weights)
+                limit = np.float32(MAX_MULTIPLIER) * multipliers
+            multipliers = _raised(multipliers, weights, limit)
+    return _best_step(forms, np.array(weights_by_step), np.array(power_by_step), bound)
+
+
+def _first_multipliers(forms: Forms, weights: Complex64Array) -> Float32Array:
+    """Return first multipliers (f, 1): the power at the loudest quiet fingertip to the weights'."""
+    loudest = np.maximum.reduce(forms.quiet_power(weights), axis=1)
+    weight_power = np.add.reduce(np.abs(weights) ** 2, axis=1)
+    return np.asarray((loudest / np.maximum(weight_power, _LEAST_POWER))[:, None])
+
+
+def _raised(
+    multipliers: Float32Array, weights: Complex64Array, limit: Float32Array
+) -> Float32Array:
+    """Return multipliers (f, n) times the squared magnitudes of weights, until these fit.
+
+    Limited, since they would grow without end where the level cannot be reached.
+    """
+    growth = np.minimum(np.abs(weights) ** 2, MAX_GROWTH)
+    return np.asarray(np.minimum(multipliers * growth, limit))
+
+
+def _best_step(
+    forms: Forms, weights: Complex64Array, quiet_power: Float32Array, bound: Float32Array
+) -> CoherentResult:
+    """Return the best weights of all steps (s, f, n), with power (s, f) at the loudest quiet
+    fingertip."""
+    peak, reaches = forms.reached(weights)
+    power = np.maximum(quiet_power, _LEAST_POWER) + _TINY * (peak * peak)
+    ratio = peak / np.sqrt(power)
+    score = np.where(reaches, ratio, 0)
+    best = (best_along(score, axis=0), np.arange(len(bound)))
+    best_weights = np.where(score[best][:, None] > 0, weights[best], 0)
+    return CoherentResult(
+        score=score[best],
+        weights=best_weights.astype(np.complex64),
+        bound=bound,
+        missed=np.maximum.reduce(np.where(reaches, 0, ratio), axis=0),
+    )
 
 
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
@@ -380,42 +414,47 @@ def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:
 
 
 def _optimise_targets(
-    R: Complex64Array, targets: Complex64Array, before: Complex64Array | None, gain: float
+    R: Complex64Array, targets: Complex64Array, start: Complex64Array | None, gain: float
 ) -> tuple[Complex64Array, Float32Array, Complex64Array]:
     """Find weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).
 
     Also returns their factors (n, t). Weights are R^-1 times the sum of the targets' conjugates,
     each times a factor, so the targets' amplitudes follow from the factors by a t by t Gram matrix.
     Each iteration sets the factors' phases to those reached and raises the factors of weaker
-    targets. before: initial factors, None for the phases that the optimum for one target gives to
+    targets. start: initial factors, None for the phases that the optimum for one target gives to
     all others. With a gain above 1 the level itself counts, of weights raised up to full stroke.
     """
     t, n, _ = targets.shape
     fields = targets.swapaxes(0, 1)
     columns = np.linalg.solve(R, fields.conj().swapaxes(1, 2))  # (n, eras, t)
     gram = fields @ columns
-    if before is None:
+    if start is None:
         count = min(t, TARGET_STARTS)
-        factors = _phases(gram[:, :, np.arange(count) * t // count].transpose(2, 0, 1))
-        steps = ALIGNMENTS
+        first_targets = np.arange(count) * t // count
+        factors = _phases(gram[:, :, first_targets].transpose(2, 0, 1))
+        iterations = ALIGNMENTS
     else:
-        factors, steps = before[None], REALIGNMENTS
-    tried, values = [], []
-    for _ in range(steps if t > 1 else 1):
+        factors = start[None]
+        iterations = REALIGNMENTS
+    factors_by_step = list[Complex64Array]()
+    bounds_by_step = list[Float32Array]()
+    for _ in range(iterations if t > 1 else 1):
         if gain > 1:
-            reached = np.matvec(fields, _saturated(_largest_one(np.matvec(columns, factors)), gain))
-            cost = np.float32(1)
+            weights = _largest_one(np.matvec(columns, factors))
+            amplitudes = np.matvec(fields, _saturated(weights, gain))
+            power = np.float32(1)
         else:
-            reached = np.matvec(gram, factors)
-            cost = np.maximum(np.vecdot(factors, reached).real, _LEAST_POWER)
-        size = np.maximum(np.abs(reached), _LEAST_AMPLITUDE)
-        tried.append(factors)
-        values.append(np.minimum.reduce(size, axis=-1) / np.sqrt(cost))
-        factors = _largest_one(np.abs(factors) / size * _phases(reached))
-    every = np.concatenate(values)
-    best = (best_along(every, axis=0), np.arange(n))
-    factors = np.concatenate(tried)[best]
-    return _largest_one(np.matvec(columns, factors)), every[best], factors
+            amplitudes = np.matvec(gram, factors)
+            power = np.maximum(np.vecdot(factors, amplitudes).real, _LEAST_POWER)
+        size = np.maximum(np.abs(amplitudes), _LEAST_AMPLITUDE)
+        factors_by_step.append(factors)
+        bounds_by_step.append(np.minimum.reduce(size, axis=-1) / np.sqrt(power))
+        factors = _largest_one(np.abs(factors) / size * _phases(amplitudes))
+    bounds = np.concatenate(bounds_by_step)
+    best = (best_along(bounds, axis=0), np.arange(n))
+    best_factors = np.concatenate(factors_by_step)[best]
+    weights = _largest_one(np.matvec(columns, best_factors))
+    return weights, bounds[best], best_factors
 
 
 def _largest_one(values: Complex64Array) -> Complex64Array:
@@ -446,47 +485,78 @@ def find_switched(forms: Forms) -> list[tuple[float, WeightedTones]]:
 
     Empty if none does. Exact: patterns are excluded by bounds only.
     """
-    t, above = len(forms.targets), np.square(forms.threshold)[:, None, None]
-    expected = np.concatenate([forms.target_power, forms.quiet.swapaxes(0, 1)]).real
-    every = np.concatenate([power_forms(forms.targets), expected]) / above
-    powers = _with_silence(every.astype(np.float32))
-    alone = np.diagonal(powers[:, 1:], axis1=2, axis2=3)
-    loudest = (alone[2 * t :] / np.maximum(alone[:t].mean(axis=0), _LEAST_POWER)).argmax(axis=0)
-    share = np.bincount(loudest.ravel(), minlength=len(powers) - 2 * t) / loudest.size
-    heard = np.tensordot(share.astype(np.float32), powers[2 * t :], axes=1)
-    target, quiet = _sums_of_pairs(np.stack([powers[:t].mean(axis=0), heard]))
-    bounds = target / np.maximum(quiet, _LEAST_POWER)
-    one, other = np.triu_indices(forms.era_count, 1)
-    bounds[one + 1 < other, :, 0] = bounds[:-1, 0] = -1  # an ERA alone counts once
-    count, bound = BATCH, bounds.ravel()
+    powers = _pattern_powers(forms)
+    bounds = _pattern_bounds(forms, powers)
+    first_era, second_era = np.triu_indices(forms.era_count, 1)
+    bound = bounds.ravel()
+    count = BATCH
     while True:
         order = np.argpartition(-bound, min(count, len(bound) - 1))
-        some = np.sort(order[:count])  # a partition's order differs between processors
-        pair, first, second = np.unravel_index(some, bounds.shape)
-        tones = np.array([[first, one[pair]], [second, other[pair]]])
-        score = np.where(bound[some] < 0, 0, _scores(forms, powers, *tones))
+        chosen = np.sort(order[:count])  # a partition's order differs between processors
+        pair, first_row, second_row = np.unravel_index(chosen, bounds.shape)
+        first = np.array([first_row, first_era[pair]])
+        second = np.array([second_row, second_era[pair]])
+        score = np.where(bound[chosen] < 0, 0, _scores(forms, powers, first, second))
         best = best_few(score, ALTERNATIVES)
         if count >= len(bound) or score[best[-1]] >= bound[order[count]]:
             break
         count *= 4
-    return [
-        (float(np.sqrt(score[each])), _drive(tones[:, :, each].tolist(), forms.era_count))
-        for each in best.tolist()
-        if score[each] > 0
-    ]
+    patterns = list[tuple[float, WeightedTones]]()
+    for number in best.tolist():
+        if score[number] > 0:
+            tones = [first[:, number].tolist(), second[:, number].tolist()]
+            patterns.append((float(np.sqrt(score[number])), _drive(tones, forms.era_count)))
+    return patterns
 
 
-def _scores(forms: Forms, powers: Float32Array, one: IntArray, other: IntArray) -> Float32Array:
+def _pattern_powers(forms: Forms) -> Float32Array:
+    """Return powers to threshold `_with_silence` (2 t + q, 1 + f, eras, eras).
+
+    Nominal at the t targets, expected there, and expected at the q quiet fingertips.
+    """
+    threshold_power = np.square(forms.threshold)[:, None, None]
+    expected = np.concatenate([forms.target_power, forms.quiet.swapaxes(0, 1)]).real
+    powers = np.concatenate([power_forms(forms.targets), expected]) / threshold_power
+    return _with_silence(powers.astype(np.float32))
+
+
+def _pattern_bounds(forms: Forms, powers: Float32Array) -> Float32Array:
+    """Return bounds (pairs, 1 + f, 1 + f) of the squared scores of all patterns, -1 for repeated
+    ones."""
+    t = len(forms.targets)
+    target_powers = powers[:t]
+    quiet_powers = powers[2 * t :]
+    alone = np.diagonal(powers[:, 1:], axis1=2, axis2=3)
+    alone_at_targets = np.maximum(alone[:t].mean(axis=0), _LEAST_POWER)
+    loudest = (alone[2 * t :] / alone_at_targets).argmax(axis=0)
+    shares = np.bincount(loudest.ravel(), minlength=len(quiet_powers)) / loudest.size
+    mean_quiet = np.tensordot(shares.astype(np.float32), quiet_powers, axes=1)
+    mean_target = target_powers.mean(axis=0)
+    target, quiet = _sums_of_pairs(np.stack([mean_target, mean_quiet]))
+    bounds = np.asarray(target / np.maximum(quiet, _LEAST_POWER))
+    first_era, second_era = np.triu_indices(forms.era_count, 1)
+    # An ERA alone counts once.
+    bounds[first_era + 1 < second_era, :, 0] = -1
+    bounds[:-1, 0] = -1
+    return bounds
+
+
+def _scores(forms: Forms, powers: Float32Array, first: IntArray, second: IntArray) -> Float32Array:
     """Return power ratios (m,) of patterns of two tones (2, m), of powers `_with_silence`.
 
-    0 where the level is not reached.
+    A tone is a row and an ERA. 0 where the level is not reached.
     """
-    (i, a), (j, b), t = one, other, len(forms.targets)
-    sums = powers[:, i, a, a] + powers[:, j, b, b] + (i == j) * 2 * powers[:, i, a, b]
-    at, deviation = sums[:t], np.sqrt(np.maximum(sums[t : 2 * t] - sums[:t], 0))
-    reaches = np.sqrt(at) - np.float32(forms.level_margin) * deviation >= forms.wanted
-    ratio = at.min(axis=0) / np.maximum(sums[2 * t :].max(axis=0), _LEAST_POWER)
-    return np.where(reaches.all(axis=0), ratio, 0)
+    i, a = first
+    j, b = second
+    t = len(forms.targets)
+    interference = (i == j) * 2 * powers[:, i, a, b]
+    sums = powers[:, i, a, a] + powers[:, j, b, b] + interference
+    nominal = sums[:t]
+    variance = np.maximum(sums[t : 2 * t] - nominal, 0)
+    least = np.sqrt(nominal) - np.float32(forms.level_margin) * np.sqrt(variance)
+    reaches = (least >= forms.wanted).all(axis=0)
+    loudest = np.maximum(sums[2 * t :].max(axis=0), _LEAST_POWER)
+    return np.asarray(np.where(reaches, nominal.min(axis=0) / loudest, 0))
 
 
 def max_sensation_switched(forms: Forms) -> float:
@@ -499,8 +569,11 @@ def highest_levels(fields: Complex64Array) -> Float32Array:
 
     fields (m, t, f, eras).
     """
-    found = [_sums_of_pairs(_with_silence(power_forms(each))).min(axis=0).max() for each in fields]
-    return np.sqrt(np.array(found, dtype=np.float32))
+    highest = list[np.float32]()
+    for target_fields in fields:
+        powers = _sums_of_pairs(_with_silence(power_forms(target_fields)))
+        highest.append(powers.min(axis=0).max())
+    return np.sqrt(np.array(highest, dtype=np.float32))
 
 
 def power_forms(fields: Complex64Array) -> Float32Array:
@@ -518,18 +591,19 @@ def _sums_of_pairs(powers: Float32Array) -> Float32Array:
 
     By the frequency of each ERA; powers `_with_silence`.
     """
-    one, other = np.triu_indices(powers.shape[-1], 1)
+    first, second = np.triu_indices(powers.shape[-1], 1)
     alone = np.diagonal(powers, axis1=2, axis2=3).swapaxes(1, 2)
-    sums = alone[:, one, :, None] + alone[:, other, None]
-    same = np.arange(powers.shape[1])
-    sums[:, :, same, same] += 2 * powers[:, :, one, other].swapaxes(1, 2)
+    sums = alone[:, first, :, None] + alone[:, second, None]
+    rows = np.arange(powers.shape[1])
+    sums[:, :, rows, rows] += 2 * powers[:, :, first, second].swapaxes(1, 2)
     return sums
 
 
 def _drive(tones: list[list[int]], eras: int) -> WeightedTones:
     """Make a drive of ERAs at full stroke, from pairs of frequency, counted from 1, and ERA."""
-    found: dict[int, Complex64Array] = {}
+    weights_by_row: dict[int, Complex64Array] = {}
     for row, era in sorted(tones):
         if row:
-            found.setdefault(row - 1, np.zeros(eras, dtype=np.complex64))[era] = 1
-    return [*found.items()]
+            weights = weights_by_row.setdefault(row - 1, np.zeros(eras, dtype=np.complex64))
+            weights[era] = 1
+    return [*weights_by_row.items()]

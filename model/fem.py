@@ -65,12 +65,14 @@ class Element:
         """
         points, weights = legendre.leggauss(len(self.side))
         powers = np.arange(len(self.side))
+        slopes_of_powers = powers * points[:, None] ** np.maximum(powers - 1, 0)
+        slope = slopes_of_powers @ self._coefficients()
         shape = self.shape(points)
-        slope = powers * points[:, None] ** np.maximum(powers - 1, 0) @ self._coefficients()
+        weighted_slope = slope.T * weights
         value = (shape.T * weights) @ shape
         means = value.sum(axis=1)
         sheared = np.outer(means, means) / 2 if self.order == 1 else value
-        return value, (slope.T * weights) @ shape, (slope.T * weights) @ slope, sheared
+        return value, weighted_slope @ shape, weighted_slope @ slope, sheared
 
     def _coefficients(self) -> FloatArray:
         """Monomial coefficients of the Lagrange polynomials, a column for each node of a side."""
@@ -85,10 +87,12 @@ class ElementRow:
     """
 
     def __init__(self, element: Element, ends: FloatArray) -> None:
-        self.ends, self._element = ends, element
-        share = (1 + np.array(element.side[:-1])) / 2
+        self.ends = ends
+        self._element = element
+        shares = (1 + np.array(element.side[:-1])) / 2
         sizes = np.diff(ends)
-        self.nodes = np.append((ends[:-1, None] + share * sizes[:, None]).ravel(), ends[-1])
+        nodes = ends[:-1, None] + shares * sizes[:, None]
+        self.nodes = np.append(nodes.ravel(), ends[-1])
         value, mixed, slope, sheared = element.integrals()
         self.integrals = {
             "vv": self._assembled(value, sizes / 2),
@@ -107,16 +111,19 @@ class ElementRow:
         """Numbers of nodes, and their functions, at places (p,) [m], (p, order + 1) each."""
         cells = np.searchsorted(self.ends, places, side="right") - 1
         cells = np.clip(cells, 0, len(self.ends) - 2)
-        start, end = self.ends[cells], self.ends[cells + 1]
-        return self.numbers(cells), self._element.shape((2 * places - start - end) / (end - start))
+        start = self.ends[cells]
+        end = self.ends[cells + 1]
+        xi = (2 * places - start - end) / (end - start)
+        return self.numbers(cells), self._element.shape(xi)
 
     def _assembled(self, matrix: FloatArray, scales: FloatArray) -> sparse.csr_array:
         numbers = self.numbers(np.arange(len(scales)))
         row, column = np.broadcast_arrays(numbers[:, :, None], numbers[:, None])
         values = (scales[:, None, None] * matrix).ravel()
-        size = len(self.nodes)
         places = (row.ravel(), column.ravel())
-        return sparse.csr_array(sparse.coo_array((values, places), shape=(size, size)))
+        size = len(self.nodes)
+        assembled = sparse.coo_array((values, places), shape=(size, size))
+        return sparse.csr_array(assembled)
 
 
 def _gauss_lobatto(order: int) -> tuple[float, ...]:
@@ -148,7 +155,7 @@ Q5_MIN_ELEMENTS = 3
 Q5_STRIP_THICKNESSES = 2.0  # the free edge's boundary layer is as wide as h
 
 MIN_NODES_PER_WAVELENGTH = 6
-"""With fewer nodes to a bending wavelength a mesh is refused."""
+"""Minimum number of nodes to a bending wavelength."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +171,7 @@ class Mesh(Discretisation):
     strip: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a mesh without elements, or with strips that fill the plate."""
+        """Reject a mesh without elements, or with strips that fill the plate."""
         if self.nx < 1 or self.ny < 1:
             raise InputError(f"mesh: elements must be 1x1 or more, got {self.nx}x{self.ny}")
         if not 0 <= 2 * self.strip < min(self.length, self.width):
@@ -177,9 +184,8 @@ class Mesh(Discretisation):
     def accurate(cls, plate: Plate, *, frequency_max: float) -> Self:
         """Make the cheapest mesh of Q5 that is accurate up to a frequency [Hz]."""
         size = plate.bending_wavelength(frequency_max) / Q5_PER_WAVELENGTH
-        nx, ny = (
-            max(Q5_MIN_ELEMENTS, math.ceil(side / size)) for side in (plate.length, plate.width)
-        )
+        nx = max(Q5_MIN_ELEMENTS, math.ceil(plate.length / size))
+        ny = max(Q5_MIN_ELEMENTS, math.ceil(plate.width / size))
         # On a thick plate the boundary layer is no narrower than an element: no strip needed.
         strip = Q5_STRIP_THICKNESSES * plate.thickness
         if strip > min(plate.length / nx, plate.width / ny) / 2:
@@ -202,13 +208,14 @@ class Mesh(Discretisation):
     @cached_property
     def along(self) -> tuple[ElementRow, ElementRow]:
         """Its elements along x and along y."""
-        found = []
-        for length, count in ((self.length, self.nx), (self.width, self.ny)):
-            ends = np.linspace(self.strip, length - self.strip, count + 1)
-            if self.strip:
-                ends = np.concatenate([[0.0], ends, [length]])
-            found.append(ElementRow(self.element, ends))
-        return found[0], found[1]
+        return self._row(self.length, self.nx), self._row(self.width, self.ny)
+
+    def _row(self, side: float, count: int) -> ElementRow:
+        """Return the elements along a side [m]: strips, and a number of others between them."""
+        ends = np.linspace(self.strip, side - self.strip, count + 1)
+        if self.strip:
+            ends = np.concatenate([[0.0], ends, [side]])
+        return ElementRow(self.element, ends)
 
     @property
     def columns(self) -> int:
@@ -260,18 +267,20 @@ class Mesh(Discretisation):
         size = plate.bending_wavelength(frequency) * order / MIN_NODES_PER_WAVELENGTH
         # Rounding must not turn a mesh that fits exactly into one too coarse.
         size *= 1 - 1e-9
-        nx, ny = (math.ceil(side / size) for side in (plate.length, plate.width))
+        nx = math.ceil(plate.length / size)
+        ny = math.ceil(plate.width / size)
         return type(self)(nx, ny, plate.length, plate.width, self.element)
 
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
-        """Return the largest deviation of its shape functions from a wave between nodes, relative.
+        """Return the largest relative error of its shape functions for a wave between nodes.
 
         A polynomial of order p follows a wave k between nodes a step s apart within (k s)^(p + 1) /
         4 (p + 1).
         """
         order = self.element.order
         step = max(self.element_size) / order
-        phase = 2 * math.pi / plate.bending_wavelength(frequency) * step
+        wavenumber = 2 * math.pi / plate.bending_wavelength(frequency)
+        phase = wavenumber * step
         return float(phase ** (order + 1) / (4 * (order + 1)))
 
     def interpolation(self, points: FloatArray) -> sparse.csr_array:
@@ -317,13 +326,16 @@ Slopes s, functions v, rotations r in shear (paper Eq. 17).
 
 def rigidities(plate: Plate) -> dict[str, float]:
     """Bending, coupled and twist [N m], and shear [N/m] of a plate's section (paper Eq. 5 to 7)."""
-    of, shares, h = plate.material, plate.material.shares, plate.thickness
-    D, S = of.E * h**3 / (12 * of.plane_stress), SHEAR_CORRECTION * of.E * h
+    material = plate.material
+    shares = material.shares
+    h = plate.thickness
+    D = material.E * h**3 / (12 * material.plane_stress)
+    S = SHEAR_CORRECTION * material.E * h
     return {
         "bending_x": D,
         "bending_y": shares.e2 * D,
-        "coupled": of.nu * shares.e2 * D,
-        "twist": shares.g12 * of.E * h**3 / 12,
+        "coupled": material.nu * shares.e2 * D,
+        "twist": shares.g12 * material.E * h**3 / 12,
         "shear_x": shares.g13 * S,
         "shear_y": shares.g23 * S,
     }
@@ -343,8 +355,9 @@ class PlateMatrices:
 
     def deflection_at(self, points: FloatArray) -> sparse.csr_array:
         """Map of the degrees of freedom to deflections at points [m] (n, 2), sparse (n, dof)."""
-        pick = sparse.csr_array(np.array([[1.0, 0.0, 0.0]]))
-        return sparse.csr_array(sparse.kron(self.mesh.interpolation(points), pick, format="csr"))
+        deflection = sparse.csr_array(np.array([[1.0, 0.0, 0.0]]))
+        interpolation = self.mesh.interpolation(points)
+        return sparse.csr_array(sparse.kron(interpolation, deflection, format="csr"))
 
 
 def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
@@ -358,8 +371,9 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
             f"mesh: must be of polynomials for {what}, got {mesh}; finite elements are for "
             "homogeneous plates in a vacuum: use mesh auto, or Legendre with degrees"
         )
-    sides = ((plate.length, mesh.length), (plate.width, mesh.width))
-    if not all(math.isclose(*side) for side in sides):
+    has_length = math.isclose(plate.length, mesh.length)
+    has_width = math.isclose(plate.width, mesh.width)
+    if not (has_length and has_width):
         raise InputError(
             f"mesh: must cover the plate of {plate.length:g} x {plate.width:g} m, got "
             f"{mesh.length:g} x {mesh.width:g} m; make the mesh for this plate"
@@ -369,7 +383,12 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
     along_x, along_y = mesh.along
     value = sparse.kron(along_y.integrals["vv"], along_x.integrals["vv"])
     mass = sparse.kron(value, np.diag([density, rotary, rotary]))  # paper Eq. 19 and 20
-    return PlateMatrices(plate, mesh, _stiffness(mesh, rigidities(plate)), sparse.csc_array(mass))
+    return PlateMatrices(
+        plate=plate,
+        mesh=mesh,
+        stiffness=_stiffness(mesh, rigidities(plate)),
+        mass=sparse.csc_array(mass),
+    )
 
 
 def _stiffness(
@@ -382,20 +401,25 @@ def _stiffness(
     """
     along_x, along_y = mesh.along
     blocks: dict[str, Any] = {}
-    for of, rigidity, integral_y, integral_x in _ENERGY:
-        factor = -section[rigidity[1:]] if rigidity[0] == "-" else section[rigidity]
+    for fields, rigidity, integral_y, integral_x in _ENERGY:
+        factor = section[rigidity.removeprefix("-")]
+        if rigidity.startswith("-"):
+            factor = -factor
         if by_side is not None:
             integral = integral_x if by_side == "x" else integral_y
-            factor *= -(of.count(by_side) + integral.count("s"))
+            factor *= -(fields.count(by_side) + integral.count("s"))
         part = sparse.kron(along_y.integrals[integral_y], along_x.integrals[integral_x])
-        blocks[of] = blocks.get(of, 0) + factor * part
-    found: Any = 0
-    for of, block in blocks.items():
+        blocks[fields] = blocks.get(fields, 0) + factor * part
+    stiffness: Any = 0
+    for fields, block in blocks.items():
+        row_field, column_field = fields[0], fields[1]
         place = np.zeros((DOF_PER_NODE, DOF_PER_NODE))
-        place["wxy".index(of[0]), "wxy".index(of[1])] = 1
-        whole = sparse.kron(block, place, format="csc")
-        found = found + (whole if of[0] == of[1] else whole + whole.T)
-    return sparse.csc_array(found)
+        place["wxy".index(row_field), "wxy".index(column_field)] = 1
+        addend = sparse.kron(block, place, format="csc")
+        if row_field != column_field:
+            addend = addend + addend.T
+        stiffness = stiffness + addend
+    return sparse.csc_array(stiffness)
 
 
 def simply_supported_modes(
@@ -406,23 +430,25 @@ def simply_supported_modes(
     All four edges have no deflection and free rotation. Raises InputError for a count above the
     mesh's number of modes.
     """
-    mesh, touch = matrices.mesh, matrices.deflection_at(footprints_of(loads))
+    mesh = matrices.mesh
+    at_loads = matrices.deflection_at(footprints_of(loads))
     springs = sparse.diags_array(np.array([load.stiffness for load in loads], dtype=float))
     masses = sparse.diags_array(np.array([load.mass for load in loads], dtype=float))
     is_free = np.ones((mesh.rows, mesh.columns, DOF_PER_NODE), dtype=bool)
-    is_free[[0, -1], :, 0] = is_free[:, [0, -1], 0] = False
+    is_free[[0, -1], :, 0] = False
+    is_free[:, [0, -1], 0] = False
     free = np.flatnonzero(is_free)
+    stiffness = sparse.csc_array(matrices.stiffness + at_loads.T @ springs @ at_loads)
+    mass = sparse.csc_array(matrices.mass + at_loads.T @ masses @ at_loads)
     eigenvalues, vectors = lowest_modes(
-        sparse.csc_array(
-            sparse.csc_array(matrices.stiffness + touch.T @ springs @ touch)[free][:, free]
-        ),
-        sparse.csc_array(sparse.csc_array(matrices.mass + touch.T @ masses @ touch)[free][:, free]),
+        sparse.csc_array(stiffness[free][:, free]),
+        sparse.csc_array(mass[free][:, free]),
         count,
         shift=(2 * np.pi * matrices.plate.lowest_bending_frequency) ** 2,
     )
-    whole = np.zeros((mesh.dof, count))
-    whole[free] = vectors
-    return np.sqrt(np.maximum(eigenvalues, 0)) / (2 * np.pi), whole
+    modes = np.zeros((mesh.dof, count))
+    modes[free] = vectors
+    return np.sqrt(np.maximum(eigenvalues, 0)) / (2 * np.pi), modes
 
 
 def lowest_modes(
@@ -441,8 +467,8 @@ def lowest_modes(
             "fewer modes or a finer mesh"
         )
     if count >= size / 2:
-        some = (0, count - 1)
-        return linalg.eigh(stiffness.toarray(), mass.toarray(), subset_by_index=some)
+        lowest = (0, count - 1)
+        return linalg.eigh(stiffness.toarray(), mass.toarray(), subset_by_index=lowest)
     factor = factorise(stiffness + shift * mass)
     eigenvalues, vectors = eigsh(
         stiffness,
@@ -477,12 +503,15 @@ def element_slopes(plate: Plate, mesh: Mesh, shapes: FloatArray) -> FloatArray:
     By the logarithms of length and width, at the same mass, and by Poisson's ratio: exactly, for
     the reasons of `model.spectral.direct_solution`.
     """
-    of, section = plate.material, rigidities(plate)
-    apart = of.orthotropy is not None  # its shear moduli do not follow from nu
-    by_nu = {key: 0.0 if apart else -value / (1 + of.nu) for key, value in section.items()}
-    for side in ("bending_x", "bending_y"):
-        by_nu[side] = 2 * of.nu * of.shares.e2 / of.plane_stress * section[side]
-    by_nu["coupled"] = of.nu * by_nu["bending_y"] + section["bending_y"]
+    material = plate.material
+    section = rigidities(plate)
+    by_nu = dict.fromkeys(section, 0.0)
+    if material.orthotropy is None:  # otherwise shear moduli do not follow from nu
+        for key, value in section.items():
+            by_nu[key] = -value / (1 + material.nu)
+    for key in ("bending_x", "bending_y"):
+        by_nu[key] = 2 * material.nu * material.shares.e2 / material.plane_stress * section[key]
+    by_nu["coupled"] = material.nu * by_nu["bending_y"] + section["bending_y"]
     slopes = (
         _stiffness(mesh, section, "x"),
         _stiffness(mesh, section, "y"),

@@ -65,21 +65,27 @@ class DiscRule:
         """
         weights = self.weights[..., None, :] * is_kept
         weights /= weights.sum(axis=-1, keepdims=True)
-        linear = np.column_stack([np.ones(len(self.points)), self.points])
+        ones = np.ones(len(self.points))
+        linear = np.column_stack([ones, self.points])
         gram = (weights[..., None, :] * linear.T) @ linear
-        means = np.concatenate([np.ones((len(low), 1)), _centroids(low, high)], axis=1)
+        centroids = _centroids(low, high)
+        means = np.concatenate([np.ones((len(low), 1)), centroids], axis=1)
         # Definite even if the remaining points lie on a line, in parts narrower than a fingertip.
-        tilt = np.linalg.solve(gram + 1e-9 * np.eye(3), means[:, :, None])[..., 0]
-        fitted = np.maximum(weights * (tilt @ linear.T), 0)
+        definite_gram = gram + 1e-9 * np.eye(3)
+        coefficients = np.linalg.solve(definite_gram, means[:, :, None])[..., 0]
+        linear_factors = coefficients @ linear.T
+        fitted = np.maximum(weights * linear_factors, 0)
         return np.asarray(fitted / fitted.sum(axis=-1, keepdims=True))
 
 
 def _rings(*rings: tuple[float, int, float]) -> DiscRule:
     """Make a rule of rings: radius, number of points, and their total weight."""
-    points, weights = [], []
+    points = list[FloatArray]()
+    weights = list[FloatArray]()
     for radius, count, weight in rings:
         angles = 2 * np.pi * np.arange(count) / count
-        points.append(radius * np.column_stack([np.cos(angles), np.sin(angles)]))
+        circle = np.column_stack([np.cos(angles), np.sin(angles)])
+        points.append(radius * circle)
         weights.append(np.full(count, weight / count))
     # Rounded, so that points lie exactly on the axes.
     return DiscRule(np.concatenate(points).round(15), np.concatenate(weights))
@@ -92,8 +98,8 @@ FINE_POINTS = _rings((0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6)
 """Twenty-one points (twelve on the rim), exact to degree 7: for figures."""
 
 FIVE_AND_FINE = DiscRule(
-    np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
-    np.stack([np.pad(FIVE_POINTS.weights, (0, 21)), np.pad(FINE_POINTS.weights, (5, 0))]),
+    points=np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
+    weights=np.stack([np.pad(FIVE_POINTS.weights, (0, 21)), np.pad(FINE_POINTS.weights, (5, 0))]),
 )
 """Both rules, the five points first, with weights (2, 26) for the mean by each."""
 
@@ -104,18 +110,25 @@ def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:
     Integrals over y are exact; over x by Gauss-Legendre points of the angle asin(x), piecewise
     between the corners where rim and rectangle meet.
     """
-    low, high = np.maximum(low, -1), np.minimum(high, 1)
-    first, last = np.arcsin(low[:, 0]), np.arcsin(high[:, 0])
-    corners = np.arccos(np.abs(np.column_stack([low[:, 1], high[:, 1]])))
+    low = np.maximum(low, -1)
+    high = np.minimum(high, 1)
+    count = len(low)
+    first = np.arcsin(low[:, :1])
+    last = np.arcsin(high[:, :1])
+    heights = np.column_stack([low[:, 1], high[:, 1]])
+    corners = np.arccos(np.abs(heights))
     ends = np.column_stack([first, -corners, corners, last])
-    ends = np.sort(np.minimum(np.maximum(ends, first[:, None]), last[:, None]), axis=1)
+    ends = np.sort(np.minimum(np.maximum(ends, first), last), axis=1)
     half = np.diff(ends, axis=1)[..., None] / 2
-    angles = (ends[:, :-1, None] + half + half * GAUSS_LEGENDRE[:, 0]).reshape(len(low), -1)
-    x, rim = np.sin(angles), np.cos(angles)
-    widths = (half * GAUSS_LEGENDRE[:, 1]).reshape(len(low), -1) * rim
-    bottom, top = np.maximum(-rim, low[:, 1:]), np.minimum(rim, high[:, 1:])
-    area = (widths * (top - bottom)).sum(axis=1)
-    along_x = (widths * x * (top - bottom)).sum(axis=1)
+    angles = (ends[:, :-1, None] + half + half * GAUSS_LEGENDRE[:, 0]).reshape(count, -1)
+    x = np.sin(angles)
+    rim = np.cos(angles)
+    widths = (half * GAUSS_LEGENDRE[:, 1]).reshape(count, -1) * rim
+    bottom = np.maximum(-rim, low[:, 1:])
+    top = np.minimum(rim, high[:, 1:])
+    height = top - bottom
+    area = (widths * height).sum(axis=1)
+    along_x = (widths * x * height).sum(axis=1)
     along_y = (widths * (top**2 - bottom**2) / 2).sum(axis=1)
     return np.asarray(np.column_stack([along_x, along_y]) / area[:, None])
 
@@ -144,15 +157,17 @@ def fingertips_on(
 
 def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
     """Return points (p, 2) [m] under a fingertip centered at x, y [m] on the plate."""
-    return np.asarray(_one(x, y, plate)[0][0])
+    points, _ = _single_fingertip(x, y, plate)
+    return np.asarray(points[0])
 
 
 def fingertip_weights(x: float, y: float, plate: Plate) -> FloatArray:
     """Return the weights (p,) of `fingertip_points` in the mean over the fingertip."""
-    return np.asarray(_one(x, y, plate)[1][0])
+    _, weights = _single_fingertip(x, y, plate)
+    return np.asarray(weights[0])
 
 
-def _one(x: float, y: float, plate: Plate) -> tuple[FloatArray, FloatArray]:
+def _single_fingertip(x: float, y: float, plate: Plate) -> tuple[FloatArray, FloatArray]:
     return fingertips_on(np.array([[x, y]]), length=plate.length, width=plate.width)
 
 
@@ -164,7 +179,7 @@ class Grid:
     ny: int
 
     def __post_init__(self) -> None:
-        """Refuse a grid without cells or with too many."""
+        """Reject a grid without cells or with too many."""
         if not (is_whole(self.nx) and is_whole(self.ny)):
             raise InputError(f"grid: numbers of cells must be integers, got {self}")
         if not (1 <= self.nx <= 200 and 1 <= self.ny <= 200):
@@ -181,7 +196,8 @@ class Grid:
     def centres(self, plate: Plate) -> FloatArray:
         """Return the centers (cell_count, 2) of the cells [m]."""
         x = (np.arange(self.nx) + 0.5) * plate.length / self.nx
-        return lattice(x, (np.arange(self.ny) + 0.5) * plate.width / self.ny)
+        y = (np.arange(self.ny) + 0.5) * plate.width / self.ny
+        return lattice(x, y)
 
 
 DEFAULT_THRESHOLD = "vibrotactile-probe"
@@ -194,11 +210,9 @@ STRONG_DB_SL = 20.0
 
 _FOLDER = resources.files("model").joinpath("data/thresholds")
 
-THRESHOLDS = tuple(
-    sorted(
-        each.name.removesuffix(".csv") for each in _FOLDER.iterdir() if each.name.endswith(".csv")
-    )
-)
+_FILES = [file.name for file in _FOLDER.iterdir() if file.name.endswith(".csv")]
+
+THRESHOLDS = tuple(sorted([name.removesuffix(".csv") for name in _FILES]))
 """Names of the sets of detection thresholds."""
 
 
@@ -219,8 +233,8 @@ def _tabulated(threshold: str) -> tuple[FloatArray, FloatArray]:
 @cache
 def highest_measured(threshold: str = DEFAULT_THRESHOLD) -> float:
     """Return the frequency [Hz] above which a set of thresholds is extrapolated."""
-    known = (row for row in _rows(threshold) if row["basis"] != "extrapolated")
-    return max(float(row["frequency_hz"]) for row in known)
+    measured = [row for row in _rows(threshold) if row["basis"] != "extrapolated"]
+    return max([float(row["frequency_hz"]) for row in measured])
 
 
 def highest_known(threshold: str = DEFAULT_THRESHOLD) -> float:
@@ -232,8 +246,10 @@ def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
     """Raise InputError for frequencies [Hz] at which a set of thresholds has no data."""
     if threshold not in THRESHOLDS:
         raise InputError(f"threshold must be one of {', '.join(THRESHOLDS)}, got {threshold!r}")
-    low, high = _tabulated(threshold)[0][[0, -1]]
-    outside = np.asarray(frequency)[~((low <= frequency) & (frequency <= high))]  # NaN too
+    tabulated, _ = _tabulated(threshold)
+    low, high = tabulated[0], tabulated[-1]
+    has_data = (low <= frequency) & (frequency <= high)
+    outside = np.asarray(frequency)[~has_data]  # NaN too
     if outside.size:
         raise InputError(
             f"frequency must be {low:g} to {high:g} Hz, where the thresholds {threshold} have "
@@ -248,8 +264,9 @@ def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
     frequencies without data.
     """
     check_has_threshold(frequency, threshold)
-    known, acceleration = _tabulated(threshold)
-    return np.exp(np.interp(np.log(frequency), np.log(known), np.log(acceleration)))
+    tabulated, accelerations = _tabulated(threshold)
+    logarithm = np.interp(np.log(frequency), np.log(tabulated), np.log(accelerations))
+    return np.exp(logarithm)
 
 
 def sensitivities(
@@ -261,7 +278,7 @@ def sensitivities(
     Raises InputError for frequencies at which any set has no data.
     """
     own = detection_threshold(frequencies, threshold)
-    return np.array([own / detection_threshold(frequencies, each) for each in sets])
+    return np.array([own / detection_threshold(frequencies, name) for name in sets])
 
 
 def sensation_level(
@@ -272,9 +289,10 @@ def sensation_level(
     frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf where nothing moves. Raises InputError
     for frequencies without data.
     """
-    lowest = detection_threshold(frequencies, threshold)
-    above = amplitudes / lowest.reshape(-1, *[1] * (amplitudes.ndim - 1))
-    return decibels(np.sqrt((above**2).sum(axis=0)))
+    thresholds = detection_threshold(frequencies, threshold)
+    other_axes = [1] * (amplitudes.ndim - 1)
+    ratios = amplitudes / thresholds.reshape(-1, *other_axes)
+    return decibels(np.sqrt((ratios**2).sum(axis=0)))
 
 
 def scale_in_words(threshold: str) -> str:
@@ -294,8 +312,8 @@ NEAR_RADIUS = 0.05
 
 def is_beyond(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
     """Return which points (p, 2) [m] are farther than NEAR_RADIUS from every target [m], (p,)."""
-    apart = np.linalg.norm(points[:, None] - np.array(targets), axis=-1)
-    beyond: NDArray[np.bool_] = (apart > NEAR_RADIUS).all(axis=1)
+    distances = np.linalg.norm(points[:, None] - np.array(targets), axis=-1)
+    beyond: NDArray[np.bool_] = (distances > NEAR_RADIUS).all(axis=1)
     return beyond
 
 
@@ -331,8 +349,9 @@ def mean_level_db_sl(
     frequencies (f,) [Hz], amplitudes (f, p) [m/s²], weights (p,) of the points; threshold: name of
     the set. Raises InputError for frequencies without data.
     """
-    above = 10 ** (sensation_level(frequencies, amplitudes, threshold) / 20)
-    return float(decibels(above @ weights))
+    levels = sensation_level(frequencies, amplitudes, threshold)
+    ratios = 10 ** (levels / 20)
+    return float(decibels(ratios @ weights))
 
 
 def over_threshold(
@@ -342,12 +361,13 @@ def over_threshold(
 
     Uses only their felt part. Beyond the data of a set, its last threshold is used.
     """
-    count, known = len(samples), _tabulated(threshold)[0]
-    frequencies = np.clip(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0], known[-1])
+    count = len(samples)
+    tabulated, _ = _tabulated(threshold)
     spectrum = np.fft.rfft(felt_part(samples, sample_rate), 2 * count, axis=0)
-    return np.fft.irfft(spectrum / detection_threshold(frequencies, threshold)[:, None], axis=0)[
-        :count
-    ]
+    frequencies = np.fft.rfftfreq(2 * count, 1 / sample_rate)
+    thresholds = detection_threshold(np.clip(frequencies, tabulated[0], tabulated[-1]), threshold)
+    ratios = np.fft.irfft(spectrum / thresholds[:, None], axis=0)
+    return ratios[:count]
 
 
 _CUTOFF = 1250.0  # Hz; where half of a tone passes
@@ -355,16 +375,19 @@ _HALF_LENGTH = 0.002  # s; of the filter: 0.5 % up to 850 Hz, 40 dB from 1.65 kH
 
 
 def felt_part(samples: FloatArray, sample_rate: float) -> FloatArray:
-    """Low-pass samples (n, p) at a rate [Hz] to what skin can feel, up to 1 kHz, without delay.
+    """Low-pass samples (n, p) at a rate [Hz] to the frequencies that skin can feel, without delay.
 
-    Before and after the samples is silence. Samples at too low a rate for more are returned as
-    they are.
+    There is silence before and after the samples. Samples are returned unchanged if their rate is
+    too low for higher frequencies.
     """
     if sample_rate <= 2 * _CUTOFF or not samples.size:
         return samples
     kernel = _kernel(sample_rate)
-    beyond = len(kernel) // 2
-    columns = [np.convolve(each, kernel)[beyond : beyond + len(samples)] for each in samples.T]
+    delay = len(kernel) // 2
+    columns = list[FloatArray]()
+    for column in samples.T:
+        filtered = np.convolve(column, kernel)
+        columns.append(filtered[delay : delay + len(samples)])
     return np.array(columns).T
 
 

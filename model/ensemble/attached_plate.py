@@ -100,21 +100,26 @@ def mounts_of(
     Errors of an ERA's stiffness are half the difference between one standard deviation up and down,
     since the suspension of an exciter is resonant; `supports` is the uncertainty of feet.
     """
-    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
-    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
+    by_spring = list[ComplexArray]()
+    by_damper = list[ComplexArray]()
+    for era in eras:
+        stiffer, _ = era.deviating(w, 1 + uncertainty.stiffness, 1.0)
+        softer, _ = era.deviating(w, 1 - uncertainty.stiffness, 1.0)
+        by_spring.append((stiffer - softer) / 2)
+        by_damping, _ = era.slopes(w)["damping"]
+        by_damper.append(getattr(era, era.fields["damping"]) * by_damping)
     feet = feet_of(masses) if uncertainty.supports else ()
     by_foot = np.zeros((len(w), max(feet, default=-1) + 1), dtype=complex)
     for number in feet:
         by_foot[:, number] = uncertainty.supports * masses[number].spring(w)
-    damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
-    single = np.complex64
+    log_damping = math.log(uncertainty.damping)
     return Mounts(
         minus_omega2=-(w**2).astype(np.float32),
-        stiffness=attached_stiffness(w, eras, masses).astype(single),
-        forces=drive_forces(w, eras).astype(single),
-        strokes=np.array([era.base(w) for era in eras]).T.astype(single),
-        by_stiffness=np.hstack([(stiffer - softer) / 2, by_foot]).astype(single),
-        by_damping=(math.log(uncertainty.damping) * np.array(damped).T).astype(single),
+        stiffness=attached_stiffness(w, eras, masses).astype(np.complex64),
+        forces=drive_forces(w, eras).astype(np.complex64),
+        strokes=np.array([era.base(w) for era in eras]).T.astype(np.complex64),
+        by_stiffness=np.hstack([np.array(by_spring).T, by_foot]).astype(np.complex64),
+        by_damping=(log_damping * np.array(by_damper).T).astype(np.complex64),
     )
 
 
@@ -150,18 +155,24 @@ class AttachedPlate(Mounts):
         plates' frequencies, of_modes (2, r, d): of each mode's own frequency and size, both in
         standard deviations.
         """
-        known = self.uncertainty
-        own = np.maximum(1 + known.mode_frequency * of_modes[0].T, LEAST_THICKNESS) ** 2
+        uncertainty = self.uncertainty
+        modal = self.modal[row]
+        mode_frequencies, mode_amplitudes = of_modes
+        v = np.maximum(1 + uncertainty.mode_frequency * mode_frequencies.T, LEAST_THICKNESS)
+        v_squared = v**2
         # The amplitude of rigid-body modes follows from the plate's known mass.
-        size = (1 + known.mode_amplitude * (self.modal[row].real > 0) * of_modes[1].T) ** 2
-        share = (known.thickness / known.frequency) ** 2 if known.frequency > 0 else 1.0
-        off = known.frequency * deviations
-        higher = np.maximum(1 + off, LEAST_THICKNESS)
-        factor = np.maximum(1 + share * off, LEAST_THICKNESS)
-        stiffness = ((higher / factor)[:, None] ** 2 * own * self.modal[row])[:, None]
-        receptance = size * modal_receptance(stiffness, self.omega[[row]], factor)[:, 0]
-        lost = -1j * math.log(known.damping) * self.modal[row].imag
-        by_loss = lost * (factor * higher**2)[:, None] * own / size * receptance**2
+        a = 1 + uncertainty.mode_amplitude * (modal.real > 0) * mode_amplitudes.T
+        a_squared = a**2
+        share = 1.0
+        if uncertainty.frequency > 0:
+            share = (uncertainty.thickness / uncertainty.frequency) ** 2
+        change = uncertainty.frequency * deviations
+        q = np.maximum(1 + change, LEAST_THICKNESS)
+        h = np.maximum(1 + share * change, LEAST_THICKNESS)
+        stiffness = ((q / h)[:, None] ** 2 * v_squared * modal)[:, None]
+        receptance = a_squared * modal_receptance(stiffness, self.omega[[row]], h)[:, 0]
+        by_log_loss = -1j * math.log(uncertainty.damping) * modal.imag
+        by_loss = by_log_loss * (h * q**2)[:, None] * v_squared / a_squared * receptance**2
         return receptance.astype(np.complex64), by_loss.astype(np.complex64)
 
     def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
@@ -169,12 +180,13 @@ class AttachedPlate(Mounts):
 
         loads (count,): relative to the rig's fingertip, empty for 1 each.
         """
-        found = np.repeat(self._finger[:, None], count, axis=1)
+        stiffness = np.repeat(self._finger[:, None], count, axis=1)
         if self.fingertip is not None:
             for number, load in enumerate(loads):
                 if load != 1:
-                    found[:, number] = self.fingertip.under(load).dynamic_stiffness(self.omega)
-        return found.astype(np.complex64)
+                    loaded = self.fingertip.under(load)
+                    stiffness[:, number] = loaded.dynamic_stiffness(self.omega)
+        return stiffness.astype(np.complex64)
 
     def load_stds(self, count: int, loads: Sequence[float] = ()) -> Float32Array:
         """Return standard deviations of the logarithm of loads, as in `finger_stiffness`,
@@ -186,8 +198,8 @@ class AttachedPlate(Mounts):
         """Return the plate with ERAs at shares (f,) of full level."""
         if (shares == 1).all():
             return self
-        by = shares[:, None].astype(np.float32)
-        return replace(self, forces=by * self.forces, strokes=by * self.strokes)
+        factors = shares[:, None].astype(np.float32)
+        return replace(self, forces=factors * self.forces, strokes=factors * self.strokes)
 
     @property
     def frequencies(self) -> FloatArray:
@@ -235,12 +247,11 @@ def attach(
 
 def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPlate:
     """Return a plate at twice the frequencies, with the sources' gains at the original ones."""
-    gains, own = (
-        np.array([each.gain(factor * twice.frequencies) for each in sources]).T
-        for factor in (0.5, 1.0)
-    )
-    share = (gains / own).astype(np.complex64)
-    return replace(twice, forces=twice.forces * share, strokes=twice.strokes * share)
+    frequencies = twice.frequencies
+    original_gains = np.array([source.gain(0.5 * frequencies) for source in sources]).T
+    gains = np.array([source.gain(frequencies) for source in sources]).T
+    ratio = (original_gains / gains).astype(np.complex64)
+    return replace(twice, forces=twice.forces * ratio, strokes=twice.strokes * ratio)
 
 
 MODELLED, THICKER, THINNER = 0, 1, 2
@@ -255,13 +266,13 @@ def thickness_nodes(count: int) -> FloatArray:
     In standard deviations: means of strata of equal probability, scaled to variance 1.
     """
     normal = NormalDist()
-    bounds = [normal.inv_cdf(each / count) for each in range(1, count)]
+    bounds = [normal.inv_cdf(number / count) for number in range(1, count)]
     density = np.array([0.0, *map(normal.pdf, bounds), 0.0])
     means = -np.diff(density)
     size = np.sqrt((means**2).mean())
-    found = means / size if size > 0 else means
-    found.setflags(write=False)  # cached, and so shared
-    return found
+    nodes = means / size if size > 0 else means
+    nodes.setflags(write=False)  # cached, and so shared
+    return nodes
 
 
 def mode_numbers(modes: int, count: int) -> FloatArray:
@@ -300,24 +311,36 @@ class PlateOnEras:
 
         If its thickness is certain, there is only the nominal one.
         """
-        deviations, first = [np.zeros(1)], {}
+        groups = [np.zeros(1)]
+        first = {}
         if plate.uncertainty.changes_modes:
-            deviations.append(np.array([1.0, -1.0]))
+            groups.append(np.array([1.0, -1.0]))
             for count in node_counts:
-                first[count] = sum(map(len, deviations))
-                deviations.append(thickness_nodes(count))
-        every = np.concatenate(deviations)
-        (f, b), t, r = plate.stiffness.shape, len(every), plate.shapes.shape[1]
-        of_modes = np.concatenate([mode_numbers(r, len(each)) for each in deviations], axis=2)
-        n, single = plate.era_count, np.complex64
-        sizes = ((f, t, r), (f, t, r), (f, t, b, r), (f, t, b, b), (f, t, b, n))
-        found = [np.empty(size, dtype=single) for size in sizes]
+                first[count] = sum(map(len, groups))
+                groups.append(thickness_nodes(count))
+        deviations = np.concatenate(groups)
+        f, b = plate.stiffness.shape
+        r = plate.shapes.shape[1]
+        t = len(deviations)
+        of_modes = np.concatenate([mode_numbers(r, len(group)) for group in groups], axis=2)
+        result = cls(
+            plate=plate,
+            first=first,
+            receptance=np.empty((f, t, r), dtype=np.complex64),
+            by_loss=np.empty((f, t, r), dtype=np.complex64),
+            by_force=np.empty((f, t, b, r), dtype=np.complex64),
+            coupling=np.empty((f, t, b, b), dtype=np.complex64),
+            moved=np.empty((f, t, b, plate.era_count), dtype=np.complex64),
+        )
         for row in range(f):
-            receptance, by_loss = plate.of_thicknesses(every, of_modes, row)
-            parts = receptance, by_loss, *_eliminated(plate, row, receptance)
-            for to, part in zip(found, parts, strict=True):
-                to[row] = part
-        return cls(plate, first, *found)
+            receptance, by_loss = plate.of_thicknesses(deviations, of_modes, row)
+            by_force, coupling, moved = _eliminated(plate, row, receptance)
+            result.receptance[row] = receptance
+            result.by_loss[row] = by_loss
+            result.by_force[row] = by_force
+            result.coupling[row] = coupling
+            result.moved[row] = moved
+        return result
 
     @property
     def fields(self) -> Complex64Array:
@@ -330,12 +353,15 @@ def _eliminated(
     plate: AttachedPlate, row: int, receptance: Complex64Array
 ) -> tuple[Complex64Array, ...]:
     """Return T, Y and motion (t, ...) of plates of receptances g (t, r) at a row."""
-    Z, w2, n = plate.stiffness[row], plate.minus_omega2[row], plate.era_count
+    Z = plate.stiffness[row]
+    w2 = plate.minus_omega2[row]
+    n = plate.era_count
     modal = plate.shapes * receptance[:, None]
     A = modal @ plate.shapes.T
     K = coupled_forces(A, Z, np.eye(len(Z), dtype=np.complex64))
     coupling = np.asarray(Z[:, None] * A * Z, dtype=np.complex64)
-    coupling.reshape(len(A), -1)[:, :: len(Z) + 1] += Z
+    diagonal = coupling.reshape(len(A), -1)[:, :: len(Z) + 1]
+    diagonal += Z
     moved = A @ (K[:, :, :n] * plate.forces[row])
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
@@ -351,18 +377,21 @@ def with_places(
     sources per standard deviation along x and y; gram (r, r): mean product of the shapes where
     fingers rest; by_field (n,): whether couples count as errors of the field.
     """
-    plate, n = on.plate, on.plate.era_count
-    deformed = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELLED, :n]
-    by_one = np.linalg.norm(on.by_force[:, MODELLED, :n], axis=2)
-    by_one = by_one * np.linalg.norm(deformed, axis=2)
-    changed, left = np.empty_like(by_one), np.empty_like(by_one)
-    for row in range(len(by_one)):
-        changed[row], left[row] = _by_places(on, row, shifts, gram, np.array(by_field))
-    by_stiffness, of_springs = plate.by_stiffness.copy(), plate.by_stiffness[:, :n]
-    size = np.hypot(np.abs(of_springs), changed / by_one)
-    by_stiffness[:, :n] = size * np.exp(1j * np.angle(of_springs))
-    found = replace(plate, by_stiffness=by_stiffness)
-    return replace(on, plate=found), left
+    plate = on.plate
+    n = plate.era_count
+    deformation = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELLED, :n]
+    by_unit_force = np.linalg.norm(on.by_force[:, MODELLED, :n], axis=2)
+    by_unit_stiffness = by_unit_force * np.linalg.norm(deformation, axis=2)
+    changes = np.empty_like(by_unit_stiffness)
+    field_errors = np.empty_like(by_unit_stiffness)
+    for row in range(len(changes)):
+        changes[row], field_errors[row] = _by_places(on, row, shifts, gram, np.array(by_field))
+    by_stiffness = plate.by_stiffness.copy()
+    by_spring = plate.by_stiffness[:, :n]
+    size = np.hypot(np.abs(by_spring), changes / by_unit_stiffness)
+    by_stiffness[:, :n] = size * np.exp(1j * np.angle(by_spring))
+    displaced = replace(plate, by_stiffness=by_stiffness)
+    return replace(on, plate=displaced), field_errors
 
 
 def _by_places(
@@ -373,18 +402,23 @@ def _by_places(
     In accelerations of the reduced coordinates [m/s²], at a row of the frequencies; and the mean
     square (n,) of the error of each field that remains.
     """
-    plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
-    g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]
+    plate = on.plate
+    n = plate.era_count
+    w2 = plate.minus_omega2[row]
+    Z = plate.stiffness[row]
+    T = on.by_force[row, MODELLED]
     forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
-    free = g * shifts
-    couples = w2 * free - ((free @ plate.shapes.T) * Z) @ T  # (n, 2, r), by 1 N
-    left, T = np.zeros_like(couples), T[:n, None]
-    along = T.conj() @ gram
-    share = (along * couples).sum(axis=2) / (along * T).sum(axis=2)
-    left[by_field] = (couples - share[..., None] * T)[by_field]
-    tilted = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
-    changed = forces[:, None, :, None] * (couples - left)[:, :, None]
-    changed = changed - tilted[..., None] * T[:, :, None]
-    square = np.vecdot(left, left @ gram).real.sum(axis=1)
-    by_drive = (np.abs(forces) ** 2 * square[:, None]).sum(axis=0)
-    return np.linalg.norm(changed.reshape(n, -1), axis=1), by_drive
+    free = on.receptance[row, MODELLED] * shifts
+    held = ((free @ plate.shapes.T) * Z) @ T
+    couples = np.asarray(w2 * free - held)  # (n, 2, r), by 1 N
+    by_force = T[:n, None]
+    along = by_force.conj() @ gram
+    share = (along * couples).sum(axis=2) / (along * by_force).sum(axis=2)
+    field_errors = np.zeros_like(couples)
+    field_errors[by_field] = (couples - share[..., None] * by_force)[by_field]
+    tilts = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
+    by_couples = forces[:, None, :, None] * (couples - field_errors)[:, :, None]
+    changes = by_couples - tilts[..., None] * by_force[:, :, None]
+    squares = np.vecdot(field_errors, field_errors @ gram).real.sum(axis=1)
+    error_power = (np.abs(forces) ** 2 * squares[:, None]).sum(axis=0)
+    return np.linalg.norm(changes.reshape(n, -1), axis=1), error_power

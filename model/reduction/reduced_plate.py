@@ -122,13 +122,15 @@ class ReducedPlate:
         """Its coordinates (r,) in the unknowns of the free plate, by symmetry class, (n, r)."""
         if self.origin is None:
             raise ValueError("only the coordinates of the plate are known")
-        modes, transform = self.origin.free.modes, self.origin.residual_transform
-        own = slice(len(modes.eigenvalues))
-        residual = slice(own.stop, own.stop + len(transform))
-        return tuple(
-            np.hstack([each[:, own], each[:, residual] @ transform])
-            for each in modes.unknowns(self.origin.points)
-        )
+        modes = self.origin.free.modes
+        transform = self.origin.residual_transform
+        mode_count = len(modes.eigenvalues)
+        residual_end = mode_count + len(transform)
+        coordinates = list[FloatArray]()
+        for columns in modes.unknowns(self.origin.points):
+            residuals = columns[:, mode_count:residual_end] @ transform
+            coordinates.append(np.hstack([columns[:, :mode_count], residuals]))
+        return tuple(coordinates)
 
     def projection_from(self, other: "ReducedPlate") -> FloatArray:
         """M-orthogonal projection of another reduction's coordinates onto its own, (r, other's r).
@@ -170,7 +172,8 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
 
     # Orthonormal combinations of the residual vectors, then the eigenvectors among these.
     scale = 1 / np.sqrt(np.diagonal(mass))
-    squared_norms, vectors = linalg.eigh(mass * np.outer(scale, scale))
+    scaled_mass = mass * np.outer(scale, scale)
+    squared_norms, vectors = linalg.eigh(scaled_mass)
     independent = squared_norms > _DEPENDENT * squared_norms.max(initial=0.0)
     orthonormal = scale[:, None] * vectors[:, independent] / np.sqrt(squared_norms[independent])
     shifted_eigenvalues, rotation = linalg.eigh(orthonormal.T @ shifted @ orthonormal)
@@ -183,17 +186,17 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     def shapes(points: FloatArray) -> FloatArray:
         places = np.atleast_2d(np.asarray(points, dtype=float))
         basis = free.modes.basis(attached, places)
-        return np.hstack(
-            [basis[:, :modes], basis[:, modes : modes + len(mass)] @ residual_transform]
-        )
+        residuals = basis[:, modes : modes + len(mass)] @ residual_transform
+        return np.hstack([basis[:, :modes], residuals])
 
+    dispersion = free.modes.dispersion
     return ReducedPlate(
-        free.plate,
-        np.concatenate([np.sqrt(free.modes.eigenvalues), omega]),
-        np.concatenate([free.modes.losses, np.zeros(len(omega))]),
-        shapes,
-        ReductionBasis(free, attached, residual_transform),
-        free.modes.dispersion and free.modes.dispersion.padded(len(omega)),
+        plate=free.plate,
+        omega=np.concatenate([np.sqrt(free.modes.eigenvalues), omega]),
+        losses=np.concatenate([free.modes.losses, np.zeros(len(omega))]),
+        at=shapes,
+        origin=ReductionBasis(free, attached, residual_transform),
+        dispersion=None if dispersion is None else dispersion.padded(len(omega)),
     )
 
 
@@ -204,9 +207,9 @@ def _products(truncated_terms: FloatArray, *, power: int) -> FloatArray:
     (RESIDUAL_VECTORS n, RESIDUAL_VECTORS m).
     """
     a = np.arange(RESIDUAL_VECTORS)
-    several = truncated_terms[np.add.outer(a, a) + power].transpose(0, 2, 1, 3)
+    products = truncated_terms[np.add.outer(a, a) + power].transpose(0, 2, 1, 3)
     rows, columns = truncated_terms.shape[1:]
-    return np.asarray(several.reshape(RESIDUAL_VECTORS * rows, RESIDUAL_VECTORS * columns))
+    return np.asarray(products.reshape(RESIDUAL_VECTORS * rows, RESIDUAL_VECTORS * columns))
 
 
 def modal_matrices(
@@ -224,26 +227,28 @@ def modal_matrices(
     known. Raises InputError for ERAs and loads that do not support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
+    phi = attachment_shapes
+    if phi is None:
+        phi = reduced.at(footprints_of(eras, loads, contacts))
     fixed = len(eras) + len(loads)
-    phi = (
-        reduced.at(footprints_of(eras, loads, contacts))
-        if attachment_shapes is None
-        else attachment_shapes
-    )
-    parts = [*(era.in_time for era in eras), *(load.in_time for load in loads)]
+    parts = [era.in_time for era in eras]
+    parts += [load.in_time for load in loads]
     elasticity, (M, C, K) = on_springs(reduced, parts, phi[:fixed])
     eigenvalues, psi = linalg.eigh(K, M)
-    omega, own = np.sqrt(eigenvalues), psi[: len(reduced.omega)]
-    lossy = (own.T * elasticity.eigenvalues * elasticity.relative_loss) @ own
-    share = np.sqrt(loss_factors(reduced.plate, omega))
-    at_fixed = phi[:fixed] @ own
+    omega = np.sqrt(eigenvalues)
+    plate_psi = psi[: len(reduced.omega)]
+    hysteretic = (plate_psi.T * elasticity.eigenvalues * elasticity.relative_loss) @ plate_psi
+    root_eta = np.sqrt(loss_factors(reduced.plate, omega))
+    in_plate = hysteretic * np.outer(root_eta, root_eta)
+    in_layers = (plate_psi.T * elasticity.losses) @ plate_psi
+    at_fixed = phi[:fixed] @ plate_psi
     lossy_springs = [0.0] * len(eras) + [load.loss_factor * load.stiffness for load in loads]
     in_springs = (at_fixed.T * lossy_springs) @ at_fixed
-    lost = lossy * np.outer(share, share) + (own.T * elasticity.losses) @ own + in_springs
-    viscous = lost / np.sqrt(np.outer(omega, omega))
+    viscous = (in_plate + in_layers + in_springs) / np.sqrt(np.outer(omega, omega))
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T
-    return _under_fingertips((M, C, K), phi[fixed:], [each.fingertip for each in contacts])
+    fingertips = [contact.fingertip for contact in contacts]
+    return _under_fingertips((M, C, K), phi[fixed:], fingertips)
 
 
 def on_springs(
@@ -255,19 +260,23 @@ def on_springs(
     The last m coordinates belong to far ends that have a mass. C includes only the parts.
     """
     elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
-    keys = ("mass", "inertance", "damping", "stiffness")
-    values = (np.array([getattr(part, key) for part in parts]) for key in keys)
-    stretched, r = stretches(parts, phi), len(reduced.omega)
-    own = stretched.copy()
-    own[:, r:] = 0.0  # of what moves with the plate alone
-    mass, inertance, damping, stiffness = (
-        (shapes.T * each) @ shapes
-        for shapes, each in zip((own, *[stretched] * 3), values, strict=True)
-    )
-    free = [part.far_mass for part in parts if part.far_mass is not None]
-    M = mass + inertance + np.diag([*np.ones(r), *free])
-    K = stiffness + np.diag(np.pad(elasticity.eigenvalues, (0, len(free))))
+    r = len(reduced.omega)
+    stretch = stretches(parts, phi)
+    plate_motion = stretch.copy()
+    plate_motion[:, r:] = 0.0  # a part's mass moves with the plate alone
+    mass = _weighted_square(plate_motion, [part.mass for part in parts])
+    inertance = _weighted_square(stretch, [part.inertance for part in parts])
+    damping = _weighted_square(stretch, [part.damping for part in parts])
+    stiffness = _weighted_square(stretch, [part.stiffness for part in parts])
+    far_masses = [part.far_mass for part in parts if part.far_mass is not None]
+    M = mass + inertance + np.diag([*np.ones(r), *far_masses])
+    K = stiffness + np.diag(np.pad(elasticity.eigenvalues, (0, len(far_masses))))
     return elasticity, (M, damping, K)
+
+
+def _weighted_square(shapes: FloatArray, weights: Sequence[float]) -> FloatArray:
+    """Return the sum over n parts of a weight times phi phi^T, for shapes (n, r)."""
+    return np.asarray((shapes.T * np.array(weights)) @ shapes)
 
 
 def stretches(parts: Sequence[InTime], phi: FloatArray) -> FloatArray:
@@ -275,10 +284,11 @@ def stretches(parts: Sequence[InTime], phi: FloatArray) -> FloatArray:
 
     The plate's displacement minus the far end's, if that has a mass.
     """
-    free = [number for number, part in enumerate(parts) if part.far_mass is not None]
-    found = np.pad(phi, ((0, 0), (0, len(free))))
-    found[free, phi.shape[1] + np.arange(len(free))] = -1.0
-    return found
+    with_far_mass = [number for number, part in enumerate(parts) if part.far_mass is not None]
+    far_count = len(with_far_mass)
+    stretch = np.pad(phi, ((0, 0), (0, far_count)))
+    stretch[with_far_mass, phi.shape[1] + np.arange(far_count)] = -1.0
+    return stretch
 
 
 def _under_fingertips(
@@ -287,9 +297,9 @@ def _under_fingertips(
     fingertips: Sequence[Fingertip],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M, C, K with n more coordinates for n fingertips at points of shapes phi (n, r)."""
-    before = len(plate[0])
+    plate_size = len(plate[0])
     M, C, K = (np.pad(matrix, (0, len(fingertips))) for matrix in plate)
-    for phalanx, (shape, tip) in enumerate(zip(phi, fingertips, strict=True), start=before):
+    for phalanx, (shape, tip) in enumerate(zip(phi, fingertips, strict=True), start=plate_size):
         contact = np.pad(shape, (0, len(M) - len(shape)))
         pulp = contact.copy()
         pulp[phalanx] = -1.0  # its stretch is the displacement of the plate less the phalanx's
@@ -348,18 +358,21 @@ def supported_modes(
     loads: Sequence[PointLoad] = (),
     frequency_max: float,
 ) -> SupportedModes:
-    """All modes up to a frequency [Hz], to which the plate must have been reduced.
+    """Solve all modes up to a frequency [Hz], to which the plate must have been reduced.
 
     Raises InputError for ERAs that do not hold the plate.
     """
     M, C, K = modal_matrices(reduced, eras, loads=loads)
-    eigenvalues, psi = linalg.eigh(K, M)
-    omega = np.sqrt(eigenvalues)
-    low = omega <= 2 * np.pi * frequency_max
-    omega, psi = omega[low], psi[:, low]
-    ratios = np.einsum("rn,rs,sn->n", psi, C, psi) / (2 * omega)
-    own = psi[: len(reduced.omega)]
-    return SupportedModes(omega / (2 * np.pi), ratios, reduced, own)
+    eigenvalues, vectors = linalg.eigh(K, M)
+    is_low = np.sqrt(eigenvalues) <= 2 * np.pi * frequency_max
+    omega = np.sqrt(eigenvalues)[is_low]
+    psi = vectors[:, is_low]
+    return SupportedModes(
+        natural_frequencies=omega / (2 * np.pi),
+        damping_ratios=np.einsum("rn,rs,sn->n", psi, C, psi) / (2 * omega),
+        reduced=reduced,
+        coordinates=psi[: len(reduced.omega)],
+    )
 
 
 _STEP = 1e-5  # of a side
@@ -372,26 +385,28 @@ def place_slopes(
 
     field: from places (m, 2 or 3) to (m, ...); sides (2,): of the plate.
     """
-    at = places[:, None, :2]
+    positions = places[:, :2]
     step = _STEP * sides
-    is_inner = np.minimum(at, sides - at)[:, 0] >= step
-    inwards = np.where(at[:, 0] > sides / 2, -1.0, 1.0)
-    # Offsets of two neighboring points, and the weights of these and of the point itself, (n, 2)
-    # each.
-    first, second = np.where(is_inner, 1.0, inwards), np.where(is_inner, -1.0, 2 * inwards)
-    own = np.where(is_inner, 0.0, -1.5 * inwards)
-    counts = own, np.where(is_inner, 0.5, 2 * inwards), np.where(is_inner, -0.5, -0.5 * inwards)
+    is_inner = np.minimum(positions, sides - positions) >= step
+    inwards = np.where(positions > sides / 2, -1.0, 1.0)
+    # Offsets of two neighboring points in steps, and the weights of the point itself and of these
+    # two, (n, 2) each.
+    first = np.where(is_inner, 1.0, inwards)
+    second = np.where(is_inner, -1.0, 2 * inwards)
+    weight = np.where(is_inner, 0.0, -1.5 * inwards)
+    first_weight = np.where(is_inner, 0.5, 2 * inwards)
+    second_weight = np.where(is_inner, -0.5, -0.5 * inwards)
     moved = np.repeat(places[:, None], 4, axis=1)  # along x, along y, then further
-    for number, steps in enumerate((first, second)):
+    for number, offsets in enumerate((first, second)):
         for axis in range(2):
-            moved[:, 2 * number + axis, axis] += steps[:, axis] * step[axis]
-    every = np.concatenate([places[:, None], moved], axis=1)
-    found = field(every.reshape(-1, places.shape[1]))
-    found = found.reshape(len(places), 5, *found.shape[1:])
-    weights = np.array(counts) / step  # (3, n, 2)
-    weights = weights.reshape(*weights.shape, *[1] * (found.ndim - 2))
-    taken = found[:, [[0, 0], [1, 2], [3, 4]]].swapaxes(0, 1)  # (3, n, 2, ...)
-    return np.asarray((weights * taken).sum(axis=0))
+            moved[:, 2 * number + axis, axis] += offsets[:, axis] * step[axis]
+    points = np.concatenate([places[:, None], moved], axis=1)
+    values = field(points.reshape(-1, places.shape[1]))
+    values = values.reshape(len(places), 5, *values.shape[1:])
+    weights = np.array([weight, first_weight, second_weight]) / step  # (3, n, 2)
+    other_axes = [1] * (values.ndim - 2)
+    by_weight = values[:, [[0, 0], [1, 2], [3, 4]]].swapaxes(0, 1)  # (3, n, 2, ...)
+    return np.asarray((weights.reshape(*weights.shape, *other_axes) * by_weight).sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -435,12 +450,12 @@ def reduced_modes(free: FreePlate, footprints: FloatArray, cells: FloatArray) ->
         frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
         stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
     return ReducedModes(
-        np.asarray(reduced.omega**2),
-        reduced.losses,
-        reduced.dispersion,
-        reduced.at,
-        reduced.at(cells),
-        stiffening,
+        eigenvalues=np.asarray(reduced.omega**2),
+        losses=reduced.losses,
+        dispersion=reduced.dispersion,
+        shapes_at=reduced.at,
+        cells=reduced.at(cells),
+        stiffening=stiffening,
     )
 
 
@@ -478,15 +493,20 @@ def places_of(
 
     movable (v,): indices of movable footprints.
     """
-    moving, shapes = footprints[movable], modes.shapes_at(footprints)
+    moving = footprints[movable]
+    shapes = modes.shapes_at(footprints)
     truncated = modes.truncated_terms(footprints, footprints)
-    by_place = place_slopes(
-        lambda points: modes.truncated_terms(points, footprints).swapaxes(0, 1), moving, sides
-    )
+
+    def truncated_at(points: FloatArray) -> FloatArray:
+        """Return the truncated sums between points and the footprints, points first."""
+        return modes.truncated_terms(points, footprints).swapaxes(0, 1)
+
+    shape_slopes = place_slopes(modes.shapes_at, moving, sides)
+    truncated_slopes = np.moveaxis(place_slopes(truncated_at, moving, sides), 2, 0)
     return AttachmentPoints(
-        footprints,
-        shapes,
-        truncated,
-        place_slopes(modes.shapes_at, moving, sides).reshape(-1, shapes.shape[1]),
-        np.moveaxis(by_place, 2, 0).reshape(len(truncated), -1, len(footprints)),
+        footprints=footprints,
+        shapes=shapes,
+        truncated=truncated,
+        shape_slopes=shape_slopes.reshape(-1, shapes.shape[1]),
+        truncated_slopes=truncated_slopes.reshape(len(truncated), -1, len(footprints)),
     )

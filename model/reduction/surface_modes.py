@@ -30,7 +30,14 @@ from model.arrays import FloatArray
 from model.structure.attachments import check_footprints_on_plate, mean_over
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.structure.surface import LEAST_KNOWN, THICKNESS, Surface, evenly_spaced, surface_shapes
+from model.structure.surface import (
+    LEAST_KNOWN,
+    THICKNESS,
+    Surface,
+    SurfaceShapes,
+    evenly_spaced,
+    surface_shapes,
+)
 
 RESIDUAL_ORDER = 4
 """Residual vectors of each point.
@@ -42,7 +49,7 @@ _MAX_NODES = 2500  # through which splines go; finer meshes are thinned
 _MAX_CACHED = 8
 _TRUNCATED = 0.75  # of the highest frequency: modes above it are not kept but summed
 _ALTERNATIVES, _WAVES = 4, 4  # surfaces with other further modes; plane waves in each such mode
-_OF_A_DISC = 0.7  # mean distance of its points from the middle, in radii
+_MEAN_DISTANCE = 0.7  # of a disc's points from its middle, in radii
 
 
 @cache
@@ -51,10 +58,12 @@ def _correlations() -> tuple[FloatArray, FloatArray]:
     from scipy.special import j0
 
     r = np.linspace(0, 40, 2001)
-    t, weights = np.polynomial.legendre.leggauss(800)
-    t, weights = (t + 1) / 2, weights / 2
+    points, weights = np.polynomial.legendre.leggauss(800)  # over -1 to 1
+    t = (points + 1) / 2
+    weights = weights / 2
     orders = np.arange(1, 2 * RESIDUAL_ORDER + 1)
-    return r, 2 * (weights * t ** (4 * orders[:, None] - 3)) @ j0(r / t[:, None])
+    powers = t ** (4 * orders[:, None] - 3)
+    return r, 2 * (weights * powers) @ j0(r / t[:, None])
 
 
 class SurfaceModes:
@@ -75,11 +84,12 @@ class SurfaceModes:
     ) -> None:
         from scipy.interpolate import RBFInterpolator
 
-        read = surface_shapes(surface.file, surface.digest, surface.normal)
-        frequencies = surface.frequency_factor(plate.thickness, plate.material.E) * read.frequencies
+        exported = surface_shapes(surface.file, surface.digest, surface.normal)
+        scale = surface.frequency_factor(plate.thickness, plate.material.E)
+        frequencies = scale * exported.frequencies
         highest = float(frequencies[-1])
         cut = min(cutoff_frequency, max(LEAST_KNOWN * frequency_max, _TRUNCATED * highest))
-        # One is left to be truncated, since sums over these need some.
+        # At least one mode is truncated, since sums over the truncated modes need some.
         self._kept = min(int(np.searchsorted(frequencies, cut)), len(frequencies) - 1)
         eigenvalues = (2 * math.pi * frequencies) ** 2
         self.eigenvalues = eigenvalues[: self._kept]
@@ -87,49 +97,47 @@ class SurfaceModes:
         self.dispersion: Dispersion | None = None
         u = 1 / (eigenvalues[self._kept :] + shift)
         self.largest_truncated = float(u.max())
-        self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        chosen = evenly_spaced(read.points, _MAX_NODES)
-        sizes = np.full(len(frequencies), math.sqrt(THICKNESS / plate.thickness))
-        differing = sizes[read.rigid :][: len(surface.sizes)]
-        differing *= surface.sizes[: len(differing)]
+        orders = np.arange(1, 2 * RESIDUAL_ORDER + 1)
+        self._powers = (u / u.max()) ** orders[:, None]
         self._spline = RBFInterpolator(
-            read.points[chosen],
-            read.shapes[chosen] * sizes,
-            kernel="cubic",
-            degree=2,
+            *_interpolated_shapes(exported, surface, plate), kernel="cubic", degree=2
         )
         self._sides = {"length": plate.length, "width": plate.width}
-        elastic, half = frequencies[read.rigid :], (len(frequencies) - read.rigid) // 2
-        self._upper = slice(read.rigid + half, len(frequencies))
+        elastic = frequencies[exported.rigid :]
+        half = len(elastic) // 2
+        self._upper = slice(exported.rigid + half, len(frequencies))
         # The straight line through frequencies by number: expected spacing, and where it would end.
-        spacing, start = np.polyfit(np.arange(half, len(elastic)) + 0.5, elastic[half:], 1)
-        self._spacing = max(float(spacing), 1e-6 * highest)
+        numbers = np.arange(half, len(elastic)) + 0.5
+        slope, start = np.polyfit(numbers, elastic[half:], 1)
+        self._spacing = max(float(slope), 1e-6 * highest)
         self._above = max(start + self._spacing * len(elastic), highest)
         self._shift = shift
         self._waves = np.empty((3, 0, 0))
-        self._known: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
+        self._cache: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
 
     def alternatives(self) -> Iterator["SurfaceModes"]:
-        """Yield surfaces that the known modes may be of, with as many further modes drawn."""
+        """Yield surfaces that can have the known modes, with as many further modes drawn."""
         count = self._upper.stop
-        beyond = self._above + self._spacing * (np.arange(count) + 0.5)
-        further = 1 / ((2 * math.pi * beyond) ** 2 + self._shift) / self.largest_truncated
-        powers = further ** np.arange(1, len(self._powers) + 1)[:, None]
-        k = self._wavenumber * np.sqrt(beyond / self._above)
+        frequencies = self._above + self._spacing * (np.arange(count) + 0.5)
+        u = 1 / ((2 * math.pi * frequencies) ** 2 + self._shift) / self.largest_truncated
+        orders = np.arange(1, len(self._powers) + 1)
+        powers = u ** orders[:, None]
+        k = self._wavenumber * np.sqrt(frequencies / self._above)
         for seed in range(_ALTERNATIVES):
-            rng, found = np.random.default_rng(seed), copy(self)
+            rng = np.random.default_rng(seed)
             direction, phase = rng.uniform(0, 2 * math.pi, (2, _WAVES, count))
-            found._waves = np.array([k * np.cos(direction), k * np.sin(direction), phase])
-            found._powers = np.hstack([self._powers, powers])
-            found._above, found._known = self._above + self._spacing * count, {}
-            yield found
+            alternative = copy(self)
+            alternative._waves = np.array([k * np.cos(direction), k * np.sin(direction), phase])
+            alternative._powers = np.hstack([self._powers, powers])
+            alternative._above = self._above + self._spacing * count
+            alternative._cache = {}
+            yield alternative
 
     @property
     def _wavenumber(self) -> float:
         """Wavenumber [rad/m] of the first mode that is estimated, of a plate with this density."""
-        return math.sqrt(
-            4 * math.pi * self._above / self._spacing / math.prod(self._sides.values())
-        )
+        area = math.prod(self._sides.values())
+        return math.sqrt(4 * math.pi * self._above / self._spacing / area)
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -137,24 +145,26 @@ class SurfaceModes:
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2)."""
-        own, other = (self._observe(each)[:, self._kept :] for each in (points, others))
-        return np.asarray((own * self._powers[:, None]) @ other.T + self._local(points, others))
+        shapes = self._observe(points)[:, self._kept :]
+        other_shapes = self._observe(others)[:, self._kept :]
+        known = (shapes * self._powers[:, None]) @ other_shapes.T
+        return np.asarray(known + self._local(points, others))
 
     def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
-        at = self._observe(others)
-        extra = self._residuals(points) @ at[:, self._kept :].T
-        extra += self._local(points, others)[:RESIDUAL_ORDER].reshape(extra.shape)
-        return np.hstack([at[:, : self._kept], extra.T])
+        shapes = self._observe(others)
+        residuals = self._residuals(points) @ shapes[:, self._kept :].T
+        residuals += self._local(points, others)[:RESIDUAL_ORDER].reshape(residuals.shape)
+        return np.hstack([shapes[:, : self._kept], residuals.T])
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` in modes, without the estimated compliance, in one part."""
         residuals = self._residuals(points)
         count = self._kept
-        found = np.zeros((count + residuals.shape[1], count + len(residuals)))
-        found[:count, :count] = np.eye(count)
-        found[count:, count:] = residuals.T
-        return (found,)
+        columns = np.zeros((count + residuals.shape[1], count + len(residuals)))
+        columns[:count, :count] = np.eye(count)
+        columns[count:, count:] = residuals.T
+        return (columns,)
 
     def _residuals(self, points: FloatArray) -> FloatArray:
         """Residual vectors in truncated modes, term by term, (RESIDUAL_ORDER n, t)."""
@@ -163,18 +173,20 @@ class SurfaceModes:
 
     def _local(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Estimated terms of modes that are not known, as `truncated_terms`, (TERMS, n, m)."""
-        own, other = np.atleast_2d(points), np.atleast_2d(others)
-        sizes = [self._sizes(self._observe(each)) for each in (own, other)]
-        apart = np.linalg.norm(own[:, None, :2] - other[None, :, :2], axis=2)
-        if own.shape[1] == other.shape[1] == 3:  # a disc yields less than a point
-            apart = np.hypot(apart, _OF_A_DISC * np.maximum(own[:, None, 2], other[None, :, 2]))
+        points = np.atleast_2d(points)
+        others = np.atleast_2d(others)
+        distances = np.linalg.norm(points[:, None, :2] - others[None, :, :2], axis=2)
+        if points.shape[1] == others.shape[1] == 3:  # a disc yields less than a point
+            radii = np.maximum(points[:, None, 2], others[None, :, 2])
+            distances = np.hypot(distances, _MEAN_DISTANCE * radii)
         r, by_order = _correlations()
-        correlations = np.array(
-            [np.interp(self._wavenumber * apart, r, each, right=0.0) for each in by_order]
-        )
+        arguments = self._wavenumber * distances
+        correlations = np.array([np.interp(arguments, r, c, right=0.0) for c in by_order])
         u = 1 / ((2 * math.pi * self._above) ** 2 + self._shift) / self.largest_truncated
-        powers = u ** np.arange(1, len(by_order) + 1)[:, None, None]
-        return np.asarray(powers * (self._above / self._spacing) * np.outer(*sizes) * correlations)
+        orders = np.arange(1, len(by_order) + 1)
+        powers = u ** orders[:, None, None]
+        sizes = np.outer(self._sizes(self._observe(points)), self._sizes(self._observe(others)))
+        return np.asarray(powers * (self._above / self._spacing) * sizes * correlations)
 
     def _sizes(self, shapes: FloatArray) -> FloatArray:
         """Root mean square of the upper half of the modes at points of shapes (p, r), (p,)."""
@@ -184,12 +196,27 @@ class SurfaceModes:
         """Shapes of all modes at points or footprints of the surface, drawn ones last, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
-        if key not in self._known:
+        if key not in self._cache:
             check_footprints_on_plate(points, **self._sides)
-            found = mean_over(self._spline, points, **self._sides)
-            along = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
-            drawn = math.sqrt(2 / _WAVES) * np.cos(along).sum(axis=1)
-            while len(self._known) >= _MAX_CACHED:
-                self._known.pop(next(iter(self._known)))
-            self._known[key] = np.hstack([found, self._sizes(found)[:, None] * drawn])
-        return self._known[key]
+            known = np.asarray(mean_over(self._spline, points, **self._sides))
+            phases = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
+            waves = math.sqrt(2 / _WAVES) * np.cos(phases).sum(axis=1)
+            drawn = self._sizes(known)[:, None] * waves
+            while len(self._cache) >= _MAX_CACHED:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[key] = np.hstack([known, drawn])
+        return self._cache[key]
+
+
+def _interpolated_shapes(
+    exported: SurfaceShapes, surface: Surface, plate: Plate
+) -> tuple[FloatArray, FloatArray]:
+    """Return nodes (n, 2) [m] through which splines go, and the shapes (n, r) of all modes there.
+
+    Scaled to the equivalent plate and to the sizes of the first elastic modes, if they are stated.
+    """
+    nodes = evenly_spaced(exported.points, _MAX_NODES)
+    sizes = np.full(len(exported.frequencies), math.sqrt(THICKNESS / plate.thickness))
+    stated = sizes[exported.rigid :][: len(surface.sizes)]
+    stated *= surface.sizes[: len(stated)]
+    return exported.points[nodes], exported.shapes[nodes] * sizes

@@ -77,24 +77,29 @@ def direct_spectral_acceleration(
         raise InputError("a direct solution has no modes, which plate.modes would change")
     mesh.check_frequencies(plate, frequencies)
     attached = footprints_of(sources, loads)
-    everywhere = np.concatenate([attached, as_footprints(points)])
-    degrees, count = (mesh.nx, mesh.ny), len(attached)
-    bases = deflections_by_class((plate.length, plate.width), degrees, everywhere)
+    places = np.concatenate([attached, as_footprints(points)])
+    degrees = (mesh.nx, mesh.ny)
+    count = len(attached)
+    bases = deflections_by_class((plate.length, plate.width), degrees, places)
+    shortest = 2 * math.pi / mesh.shortest_wavelength
     omega = 2 * np.pi * np.asarray(frequencies, dtype=float)
-    receptance = np.empty((len(omega), len(everywhere), count), dtype=complex)
+    receptance = np.empty((len(omega), len(places), count), dtype=complex)
     for number, frequency in enumerate(frequencies):
-        local = short_wave_plate(plate, 2 * math.pi / mesh.shortest_wavelength, frequency)
-        receptance[number] = local_compliance(local, degrees, everywhere, attached) / (
-            1 + 1j * float(loss_factors(plate, omega[number]))
-        )
-        layered = AtOneFrequency(plate, degrees, frequency)
+        local_plate = short_wave_plate(plate, shortest, frequency)
+        compliance = local_compliance(local_plate, degrees, places, attached)
+        receptance[number] = compliance / (1 + 1j * float(loss_factors(plate, omega[number])))
+        plate_at_frequency = AtOneFrequency(plate, degrees, frequency)
         for parity, shapes in zip(CLASSES, bases, strict=True):
-            D = layered.dynamic_stiffness(parity, frequency)
+            D = plate_at_frequency.dynamic_stiffness(parity, frequency)
             receptance[number] += shapes @ np.linalg.solve(D, shapes[:count].T)
     between, to_points = np.split(receptance, [count], axis=1)
-    return unit_accelerations(
-        sources, loads, omega, lambda *by: (to_points @ coupled_forces(between, *by)).swapaxes(1, 2)
-    )
+
+    def displacements(held: ComplexArray, driven: ComplexArray) -> ComplexArray:
+        """Return displacements (f, n, p) by forces on attachments of dynamic stiffnesses."""
+        forces = coupled_forces(between, held, driven)
+        return np.asarray(to_points @ forces).swapaxes(1, 2)
+
+    return unit_accelerations(sources, loads, omega, displacements)
 
 
 class AtOneFrequency(SpectralPlate):
@@ -102,27 +107,33 @@ class AtOneFrequency(SpectralPlate):
 
     def dynamic_stiffness(self, parity: tuple[int, int], frequency: float) -> ComplexArray:
         """Force by deflection in the polynomials of a class at a frequency [Hz], (m, m)."""
-        of, omega = self.functions(parity), 2 * math.pi * frequency
-        moduli = [layer.modulus(frequency) for layer in self._layers]
-        own_loss = 1j * float(loss_factors(self._plate, np.asarray(omega)))
-        moduli = [each + own_loss * each.real for each in moduli]
-        m = of.deflections
-        D: ComplexArray = np.asarray(
-            self.stiffness(of, [each.real for each in moduli])
-            + 1j * self.stiffness(of, [each.imag for each in moduli])
-        )
-        D[m:, m:] -= omega**2 * along_mass(of, self._mass, np.eye(of.size - m))
-        D[:m, :m] -= omega**2 * self._inertia(of)
-        result = D[:m, :m] - D[:m, m:] @ np.linalg.solve(D[m:, m:], D[m:, :m])
+        functions = self.functions(parity)
+        omega = 2 * math.pi * frequency
+        loss_factor = 1j * float(loss_factors(self._plate, np.asarray(omega)))
+        real_moduli = list[float]()
+        imaginary_moduli = list[float]()
+        for layer in self._layers:
+            own_modulus = layer.modulus(frequency)
+            modulus = own_modulus + loss_factor * own_modulus.real
+            real_moduli.append(modulus.real)
+            imaginary_moduli.append(modulus.imag)
+        elastic = self.stiffness(functions, real_moduli)
+        lossy = self.stiffness(functions, imaginary_moduli)
+        D: ComplexArray = np.asarray(elastic + 1j * lossy)
+        w = slice(0, functions.deflections)
+        along = slice(functions.deflections, None)
+        identity = np.eye(functions.size - functions.deflections)
+        D[along, along] -= omega**2 * along_mass(functions, self._mass, identity)
+        D[w, w] -= omega**2 * self._inertia(functions)
+        condensed = D[w, w] - D[w, along] @ np.linalg.solve(D[along, along], D[along, w])
         gap = self._plate.air_gap
-        if gap is not None:
-            air = air_motion(of, gap)
-            full = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
-            full -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
-            result = (
-                result + full[:m, :m] - full[:m, m:] @ np.linalg.solve(full[m:, m:], full[m:, :m])
-            )
-        return result
+        if gap is None:
+            return np.asarray(condensed)
+        air = air_motion(functions, gap)
+        G = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
+        G -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
+        held_back = G[w, along] @ np.linalg.solve(G[along, along], G[along, w])
+        return np.asarray(condensed + G[w, w] - held_back)
 
 
 _STEP = 1e-4  # of Poisson's ratio: exact to its square
@@ -146,19 +157,21 @@ def stiffness_slopes(
     moduli = [layer.modulus(frequency).real for layer in layers]
 
     def section(further_nu: float) -> CrossSection:
-        changed = [
-            replace(each, material=replace(each.material, nu=each.material.nu + further_nu))
-            for each in layers
-        ]
+        changed = list[LaminateLayer]()
+        for layer in layers:
+            material = replace(layer.material, nu=layer.material.nu + further_nu)
+            changed.append(replace(layer, material=material))
         return section_of(changed, moduli, corrections)
 
     nominal = section(0.0)
     slopes = np.zeros((3, *2 * unknowns[0].shape[1:]))
-    for of, v in _shapes(plate, degrees, unknowns, nominal):
+    for functions, v in _shapes(plate, degrees, unknowns, nominal):
         for side in range(2):
-            slopes[side] += v.T @ class_stiffness(of, nominal, side) @ v
+            K = class_stiffness(functions, nominal, side)
+            slopes[side] += v.T @ K @ v
         for step in (_STEP, -_STEP):
-            slopes[2] += v.T @ class_stiffness(of, section(step)) @ v / (2 * step)
+            K = class_stiffness(functions, section(step))
+            slopes[2] += v.T @ K @ v / (2 * step)
     return slopes
 
 
@@ -179,11 +192,12 @@ def grain_slopes(
         return section_of([layer], [material.E], shear_corrections(layers))
 
     slopes = np.zeros((2, unknowns[0].shape[1]))
-    for of, v in _shapes(plate, degrees, unknowns, section()):
+    for functions, v in _shapes(plate, degrees, unknowns, section()):
         for number, key in enumerate(("e2", "g12")):
-            own = getattr(material.shares, key)
+            share = getattr(material.shares, key)
             for step in (_STEP, -_STEP):
-                K = class_stiffness(of, section(**{key: own * (1 + step)}))
+                changed = section(**{key: share * (1 + step)})
+                K = class_stiffness(functions, changed)
                 slopes[number] += np.einsum("nr,nr->r", v, K @ v) / (2 * step)
     return slopes
 
@@ -193,14 +207,13 @@ def _shapes(
 ) -> Iterator[tuple[ClassFunctions, FloatArray]]:
     """Yield of each class its functions, and shapes with their displacements along the plate."""
     layers = layers_of(plate)
-    x, y = (
-        EdgedFunctions(side, degree, edge_decays(nominal, along))
-        for along, (side, degree) in enumerate(
-            zip((plate.length, plate.width), degrees, strict=True)
-        )
-    )
+    nx, ny = degrees
+    x = EdgedFunctions(plate.length, nx, edge_decays(nominal, 0))
+    y = EdgedFunctions(plate.width, ny, edge_decays(nominal, 1))
     shift = (2 * np.pi * plate.lowest_bending_frequency) ** 2
+    mass = interface_mass(layers)
     for parity, w in zip(CLASSES, unknowns, strict=True):
-        of = ClassFunctions(x, y, parity, len(layers) + 1)
-        along = follow(of, class_stiffness(of, nominal), interface_mass(layers), shift) @ w
-        yield of, np.vstack([w, along])
+        functions = ClassFunctions(x, y, parity, len(layers) + 1)
+        K = class_stiffness(functions, nominal)
+        along = follow(functions, K, mass, shift) @ w
+        yield functions, np.vstack([w, along])

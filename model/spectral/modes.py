@@ -75,6 +75,7 @@ NODES = 12
 """Frequencies of a band at which modes state their stiffness."""
 
 _SPAN = 1.5  # of the moduli of the three plates if only losses matter
+_RIGID = 1e-6  # times the shift: eigenvalues below are rounding of rigid motions
 _DEPENDENT = 1e-10  # share of the largest below which directions of the space are left out
 _STEPS = 12  # of the iteration for a complex mode, which takes three or four
 
@@ -155,26 +156,39 @@ class SpectralPlate:
 
         shift [rad²/s²]: of the order of the lowest ones.
         """
-        of, gap = self.functions(parity), self._plate.air_gap
-        air = None if gap is None else air_motion(of, gap)
-        middle = [layer.modulus(band.middle).real for layer in self._layers]
-        K, M, _ = self._condensed(of, air, middle, band.middle, shift)
-        eigenvalues, q = linalg.eigh(K, M, check_finite=False)
-        eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
+        functions = self.functions(parity)
+        gap = self._plate.air_gap
+        air = None if gap is None else air_motion(functions, gap)
+        moduli = [layer.modulus(band.middle).real for layer in self._layers]
+        K, M, _ = self._condensed(functions, air, moduli, band.middle, shift)
+        eigenvalues, vectors = linalg.eigh(K, M, check_finite=False)
+        eigenvalues[np.abs(eigenvalues) < _RIGID * shift] = 0.0
         count = int(np.searchsorted(eigenvalues, cut))
-        kept, losses = eigenvalues[:count].copy(), np.zeros(count)
-        dispersion, own = np.zeros((NODES, count), dtype=complex), 1 + 1j * self._plate.loss_factor
-        shapes = q[: of.deflections].copy()
-        if count and (air is not None or not all(layer.is_elastic for layer in self._layers)):
-            space = _Space(self, of, air, band, shift, count)
+        modes = SpectralClass(
+            eigenvalues=eigenvalues[:count].copy(),
+            losses=np.zeros(count),
+            dispersion=np.zeros((NODES, count), dtype=complex),
+            truncated=eigenvalues[count:],
+            shapes=vectors[: functions.deflections].copy(),
+        )
+        is_lossy = air is not None or not all(layer.is_elastic for layer in self._layers)
+        if count and is_lossy:
+            space = _Space(self, functions, air, band, shift, count)
             for number in range(count):
-                value, shape, elsewhere = space.mode(number, float(eigenvalues[number]))
-                value = complex(value.real if eigenvalues[number] else 0.0, value.imag)
-                kept[number] = value.real
-                losses[number] = max(value.imag, 0.0) - self._plate.loss_factor * value.real
-                dispersion[:, number] = elsewhere - kept[number] * own - 1j * losses[number]
-                shapes[:, number] = shape
-        return SpectralClass(kept, losses, dispersion, eigenvalues[count:], shapes)
+                self._replace_by_complex_mode(modes, number, space)
+        return modes
+
+    def _replace_by_complex_mode(self, modes: SpectralClass, number: int, space: "_Space") -> None:
+        """Replace a real mode by the complex one near it, with its losses and dispersion."""
+        loss_factor = self._plate.loss_factor
+        real_value = float(modes.eigenvalues[number])
+        complex_value, shape, values_in_band = space.mode(number, real_value)
+        value = complex_value.real if real_value else 0.0
+        loss = max(complex_value.imag, 0.0) - loss_factor * value
+        modes.eigenvalues[number] = value
+        modes.losses[number] = loss
+        modes.dispersion[:, number] = values_in_band - value * (1 + 1j * loss_factor) - 1j * loss
+        modes.shapes[:, number] = shape
 
     def _inertia(self, of: ClassFunctions) -> FloatArray:
         """Mass between the polynomials of the deflection, (m, m)."""
@@ -194,19 +208,21 @@ class SpectralPlate:
         shift: float,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Stiffness and mass in deflection and flows, and what follows the deflection."""
-        m = of.deflections
+        w = slice(0, of.deflections)
+        along = slice(of.deflections, None)
         K = self.stiffness(of, moduli)
         follows = follow(of, K, self._mass, shift)
         rotary = follows.T @ along_mass(of, self._mass, follows)
-        stiffness = K[:m, :m] + K[:m, m:] @ follows - shift * rotary
+        stiffness = K[w, w] + K[w, along] @ follows - shift * rotary
         mass = self._inertia(of) + rotary
         gap = self._plate.air_gap
         if air is not None and gap is not None:
-            own, mass_of_w = stiffness, mass
+            plate_stiffness = stiffness
+            plate_mass = mass
             stiffness = gap.bulk_modulus(frequency).real * air.stiffness
-            stiffness[:m, :m] += own
+            stiffness[w, w] += plate_stiffness
             mass = np.diag(gap.inertia(frequency).real * air.inertia)
-            mass[:m, :m] = mass_of_w
+            mass[w, w] = plate_mass
         return (stiffness + stiffness.T) / 2, (mass + mass.T) / 2, follows
 
 
@@ -222,48 +238,70 @@ class _Space:
         shift: float,
         count: int,
     ) -> None:
-        self._band, self._gap = band, plate._plate.air_gap
+        self._band = band
+        self._gap = plate._plate.air_gap
         self._loss_factor = plate._plate.loss_factor
-        layers, m = plate._layers, of.deflections
-        deflections, alongs, flows = [], [], []
-        for frequency, factor in ((band.middle, 1), (band.low, 1 / _SPAN), (band.high, _SPAN)):
-            moduli = [
-                layer.modulus(frequency).real * (1 if layer.is_elastic else factor)
-                for layer in layers
-            ]
-            K, M, follows = plate._condensed(of, air, moduli, frequency, shift)
-            last = min(count + 1, len(K)) - 1
-            _, q = linalg.eigh(K, M, subset_by_index=[0, last], check_finite=False)
-            deflections.append(q[:m])
-            alongs.append(follows @ q[:m])
-            flows.append(q[m:])
-        w, u, a = (np.hstack(each) for each in (deflections, alongs, flows))
+        layers = plate._layers
+        w, u, a, start_count = self._real_modes(plate, of, air, shift, count)
         along = np.vstack([w, u])
-        heavy = w.T @ plate._inertia(of) @ w + u.T @ along_mass(of, plate._mass, u)
+        plate_mass = w.T @ plate._inertia(of) @ w + u.T @ along_mass(of, plate._mass, u)
+        air_mass = np.zeros_like(plate_mass)
+        air_stiffness = air_mass
+        mass = plate_mass
         if air is not None and self._gap is not None:
             moving = np.vstack([w, a])
-            self._air_mass = moving.T @ (air.inertia[:, None] * moving)
-            self._air_stiffness = moving.T @ air.stiffness @ moving
-            whole = heavy + self._gap.inertia(band.middle).real * self._air_mass
-        else:
-            self._air_mass = self._air_stiffness = np.zeros_like(heavy)
-            whole = heavy
-        sizes, directions = linalg.eigh((whole + whole.T) / 2)
-        chosen = sizes > _DEPENDENT * sizes[-1]
-        basis = directions[:, chosen] / np.sqrt(sizes[chosen])
+            air_mass = moving.T @ (air.inertia[:, None] * moving)
+            air_stiffness = moving.T @ air.stiffness @ moving
+            mass = plate_mass + self._gap.inertia(band.middle).real * air_mass
+        sizes, directions = linalg.eigh((mass + mass.T) / 2)
+        is_independent = sizes > _DEPENDENT * sizes[-1]
+        basis = directions[:, is_independent] / np.sqrt(sizes[is_independent])
+
+        def stiffness(moduli: Sequence[float]) -> FloatArray:
+            """Return the stiffness in the basis; moduli: Young's modulus of each layer."""
+            in_modes = along.T @ (plate.stiffness(of, moduli) @ along)
+            return np.asarray(basis.T @ in_modes @ basis)
+
         self._soft = [layer for layer in layers if not layer.is_elastic]
-        fixed = [layer.material.E if layer.is_elastic else 0.0 for layer in layers]
-        unit = [[float(each is soft) for each in layers] for soft in self._soft]
-        self._fixed, *self._by_layer = (
-            basis.T @ (along.T @ (plate.stiffness(of, moduli) @ along)) @ basis
-            for moduli in (fixed, *unit)
-        )
-        self._mass = basis.T @ heavy @ basis
-        self._air_mass, self._air_stiffness = (
-            basis.T @ each @ basis for each in (self._air_mass, self._air_stiffness)
-        )
+        self._fixed = stiffness([layer.material.E if layer.is_elastic else 0.0 for layer in layers])
+        self._by_layer = list[FloatArray]()
+        for soft in self._soft:
+            self._by_layer.append(stiffness([float(layer is soft) for layer in layers]))
+        self._mass = basis.T @ plate_mass @ basis
+        self._air_mass = basis.T @ air_mass @ basis
+        self._air_stiffness = basis.T @ air_stiffness @ basis
         self._deflections = w @ basis
-        self._starts = basis.T @ whole[:, : last + 1]
+        self._starts = basis.T @ mass[:, :start_count]
+
+    def _real_modes(
+        self,
+        plate: SpectralPlate,
+        of: ClassFunctions,
+        air: AirMotion | None,
+        shift: float,
+        count: int,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+        """Return deflections, displacements along the plate, and flows of three plates' modes.
+
+        One mode a column; also the number of modes of one plate.
+        """
+        band = self._band
+        deflections = list[FloatArray]()
+        alongs = list[FloatArray]()
+        flows = list[FloatArray]()
+        for frequency, factor in ((band.middle, 1), (band.low, 1 / _SPAN), (band.high, _SPAN)):
+            moduli = list[float]()
+            for layer in plate._layers:
+                scale = 1 if layer.is_elastic else factor
+                moduli.append(layer.modulus(frequency).real * scale)
+            K, M, follows = plate._condensed(of, air, moduli, frequency, shift)
+            last = min(count + 1, len(K)) - 1
+            _, vectors = linalg.eigh(K, M, subset_by_index=[0, last], check_finite=False)
+            deflection = vectors[: of.deflections]
+            deflections.append(deflection)
+            alongs.append(follows @ deflection)
+            flows.append(vectors[of.deflections :])
+        return np.hstack(deflections), np.hstack(alongs), np.hstack(flows), last + 1
 
     def mode(self, number: int, eigenvalue: float) -> tuple[complex, FloatArray, ComplexArray]:
         """Return the complex eigenvalue [rad²/s²] of a mode near a real one, and its deflection
@@ -271,12 +309,14 @@ class _Space:
 
         Also its eigenvalue at the frequencies of the band, for the same shape, (k,).
         """
-        value, start = complex(eigenvalue), self._starts[:, number].astype(complex)
+        value = complex(eigenvalue)
+        start = self._starts[:, number].astype(complex)
         mode = start
         for _ in range(_STEPS):
             A, B = self._matrices(self._band.within(value.real))
-            before, value = value, (mode @ A @ mode) / (mode @ B @ mode)
-            if abs(value - before) <= 1e-10 * (abs(value) + 1.0):
+            last_value = value
+            value = (mode @ A @ mode) / (mode @ B @ mode)
+            if abs(value - last_value) <= 1e-10 * (abs(value) + 1.0):
                 break
             mode = np.linalg.solve(A - value * (1 + 1e-12) * B, B @ mode)
             mode /= np.linalg.norm(mode)
@@ -284,13 +324,14 @@ class _Space:
         if not abs(np.vdot(mode, start)) ** 2 > 0.5 * norms.real:  # mostly another mode, or NaN
             values, modes = np.linalg.eig(np.linalg.solve(B, A))
             nearest = int(np.argmax(np.abs(start @ self._mass @ modes)))
-            value, mode = complex(values[nearest]), modes[:, nearest]
+            value = complex(values[nearest])
+            mode = modes[:, nearest]
         mode = mode / np.sqrt(mode @ B @ mode)
-        elsewhere = [
-            mode @ A @ mode + (2 * math.pi * frequency) ** 2 * (1 - mode @ B @ mode)
-            for frequency, (A, B) in zip(self._band.frequencies, self._at_nodes, strict=True)
-        ]
-        return value, self._deflections @ mode.real, np.array(elsewhere)
+        values_in_band = list[complex]()
+        for frequency, (A, B) in zip(self._band.frequencies, self._at_nodes, strict=True):
+            omega2 = (2 * math.pi * frequency) ** 2
+            values_in_band.append(mode @ A @ mode + omega2 * (1 - mode @ B @ mode))
+        return value, self._deflections @ mode.real, np.array(values_in_band)
 
     @cached_property
     def _at_nodes(self) -> list[tuple[ComplexArray, FloatArray]]:
@@ -298,13 +339,14 @@ class _Space:
 
     def _matrices(self, frequency: float) -> tuple[ComplexArray, FloatArray]:
         """Stiffness with all losses, and mass, at a frequency [Hz]."""
-        stiffness = self._fixed * (1 + 1j * self._loss_factor)
-        for layer, own in zip(self._soft, self._by_layer, strict=True):
+        stiffness: ComplexArray = np.asarray(self._fixed * (1 + 1j * self._loss_factor))
+        for layer, by_modulus in zip(self._soft, self._by_layer, strict=True):
             modulus = layer.modulus(frequency)
-            stiffness += (modulus + 1j * self._loss_factor * modulus.real) * own
+            stiffness += (modulus + 1j * self._loss_factor * modulus.real) * by_modulus
         mass = self._mass
         if self._gap is not None:
-            inertia, omega = self._gap.inertia(frequency), 2 * math.pi * frequency
+            omega = 2 * math.pi * frequency
+            inertia = self._gap.inertia(frequency)
             stiffness += self._gap.bulk_modulus(frequency) * self._air_stiffness
             stiffness -= 1j * omega**2 * inertia.imag * self._air_mass
             mass = mass + inertia.real * self._air_mass
@@ -364,20 +406,24 @@ def compliance_between(
     plate: Plate, own: UnresolvedCompliance, other: UnresolvedCompliance
 ) -> FloatArray:
     """Unresolved compliance [m/N] (n, m); see `local_compliance`."""
-    places, others = own.footprints, other.footprints
+    places = own.footprints
+    others = other.footprints
     distance = np.hypot(*(places[:, None, :2] - others[:, :2]).transpose(2, 0, 1))
     wavenumber = np.sqrt(np.multiply.outer(own.wavenumber, other.wavenumber))
     result = np.zeros(distance.shape)
     i, j = np.nonzero(distance * wavenumber < _FAR)
-    k, d = wavenumber[i, j], distance[i, j]
+    k = wavenumber[i, j]
+    d = distance[i, j]
     bending = np.sqrt(own.bending[i] * other.bending[j])
     shear = np.sqrt(own.shear[i] * other.shear[j])
-    radii = places[i, 2], others[j, 2]
-    on_discs = (radii[0] > 0) | (radii[1] > 0)
+    radius = places[i, 2]
+    other_radius = others[j, 2]
+    on_discs = (radius > 0) | (other_radius > 0)
     result[i, j] = (bending + shear) * _decay(k * d)
     if on_discs.any():
-        footprints = [each[on_discs] for each in (k, d, *radii)]
-        share, decades = _on_discs(*footprints)
+        share, decades = _on_discs(
+            k[on_discs], d[on_discs], radius[on_discs], other_radius[on_discs]
+        )
         decade = np.sqrt(own.decade[i] * other.decade[j])[on_discs]
         result[i[on_discs], j[on_discs]] = bending[on_discs] * share + decade * decades
     result[i, j] *= 1 - (k * d / _FAR) ** 4
@@ -430,7 +476,8 @@ def unresolved_at(
     if places[:, 2].any():
         centroids = mean_over(np.asarray, places, length=plate.length, width=plate.width)
         points = points + _TO_CENTROID * (centroids - points)
-    D, nu, h = plate.flexural_rigidity, plate.material.nu, plate.thickness
+    D = plate.flexural_rigidity
+    nu = plate.material.nu
     sides = np.array([plate.length, plate.width])
     p = np.array(degrees)
     cosine = np.clip(1 - 2 * points / sides, -1, 1)
@@ -438,24 +485,26 @@ def unresolved_at(
     resolved = 2 * (p - _UNRESOLVED) / (sides * sine)
     wave = p - _CURVATURE
     excess = 1 + np.cos(2 * wave * np.arccos(cosine)) / (wave * sine)
-    to_edge = np.maximum(np.minimum(points, sides - points), 0)
-    # Of waves along the edge x = 0, whose distance is along x.
     missing = excess / resolved**2
     wavelengths2 = np.maximum(_COS2 * missing[:, :1], _SIN2 * missing[:, 1:])
-    ratio_at_edge = 8 / ((1 - nu) * (3 + nu)) - 1
-    edge = _edge_excess(2 * to_edge * resolved[:, ::-1], ratio_at_edge, 2 * (1 - nu) / (3 + nu))
-    at_corner = edge.prod(axis=1) / ratio_at_edge**2
-    bending = 1 + edge.sum(axis=1) + (_CORNER - 1 - 2 * ratio_at_edge) * at_corner
-    mean = wavelengths2.mean(axis=1)
+    # Of waves along the edge x = 0, whose distance is along x.
+    to_edge = np.maximum(np.minimum(points, sides - points), 0)
+    q = 2 * to_edge * resolved[:, ::-1]
+    F_less_1 = 8 / ((1 - nu) * (3 + nu)) - 1
+    G = 2 * (1 - nu) / (3 + nu)
+    edge = _edge_excess(q, F_less_1, G)
+    at_corner = edge.prod(axis=1) / F_less_1**2
+    bending = 1 + edge.sum(axis=1) + (_CORNER - 1 - 2 * F_less_1) * at_corner
     softness = D / plate.rigidity_towards(_COS2)  # 1 for isotropic materials
-    logarithm = np.log(np.maximum(1, wavelengths2 / h**2)).mean(axis=1) / 2
-    images = (1 + edge / ratio_at_edge).prod(axis=1)
+    mean_bending = (wavelengths2 * softness).mean(axis=1)
+    logarithm = np.log(np.maximum(1, wavelengths2 / plate.thickness**2)).mean(axis=1) / 2
+    images = (1 + edge / F_less_1).prod(axis=1)
     return UnresolvedCompliance(
-        places,
-        bending * (wavelengths2 * softness).mean(axis=1) / (4 * np.pi * D),
-        images * logarithm / (2 * np.pi * plate.shear_rigidity),
-        mean**-0.5,
-        images * math.log(10) / (2 * np.pi * plate.shear_rigidity),
+        footprints=places,
+        bending=bending * mean_bending / (4 * np.pi * D),
+        shear=images * logarithm / (2 * np.pi * plate.shear_rigidity),
+        wavenumber=wavelengths2.mean(axis=1) ** -0.5,
+        decade=images * math.log(10) / (2 * np.pi * plate.shear_rigidity),
     )
 
 
@@ -530,7 +579,7 @@ class SpectralMesh(Discretisation):
     strip: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse degrees out of range."""
+        """Reject degrees out of range."""
         if not MIN_DEGREE <= min(self.nx, self.ny) <= max(self.nx, self.ny) <= MAX_DEGREE:
             raise InputError(
                 f"mesh: degrees must be {MIN_DEGREE} to {MAX_DEGREE}, got {self.nx}x{self.ny}"
@@ -563,12 +612,13 @@ class SpectralMesh(Discretisation):
         acting = stiffness / (1 + stiffness / (_AS_IF_RIGID * wave_stiffness))
         errors = _PER_STIFFNESS * (1 + _ON_SMALL_PLATES * small) * acting
         errors += _PER_WAVE_STIFFNESS * wave_stiffness
-        more = _ACCURATE + _PER_DECADE * max(0.0, math.log10(0.01 / accuracy))
+        extra_degrees = _ACCURATE + _PER_DECADE * max(0.0, math.log10(0.01 / accuracy))
         degrees = []
         for side in (plate.length, plate.width):
             waves = math.pi * side / wavelength
-            least = max(MIN_DEGREE, math.ceil(waves + more * max(1, waves / _MANY) ** (1 / 3)))
-            possible = np.arange(least, MAX_DEGREE + 1)
+            further = extra_degrees * max(1, waves / _MANY) ** (1 / 3)
+            lowest = max(MIN_DEGREE, math.ceil(waves + further))
+            possible = np.arange(lowest, MAX_DEGREE + 1)
             shares = errors * (_AT_DEGREE / possible) ** _FALLS
             accurate = shares * edge_compliance(plate, side, possible, foot) <= accuracy
             if not accurate.any():
@@ -605,10 +655,8 @@ class SpectralMesh(Discretisation):
     def resolving(self, plate: Plate, frequency: float) -> Self:
         """Lowest degrees that resolve a frequency [Hz]."""
         half = plate.bending_wavelength(frequency) / math.pi
-        nx, ny = (
-            max(MIN_DEGREE, math.ceil(side / half) + _RESOLVES)
-            for side in (plate.length, plate.width)
-        )
+        nx = max(MIN_DEGREE, math.ceil(plate.length / half) + _RESOLVES)
+        ny = max(MIN_DEGREE, math.ceil(plate.width / half) + _RESOLVES)
         return type(self)(nx, ny, plate.length, plate.width)
 
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
@@ -642,11 +690,9 @@ class KnownModes(Discretisation):
     @property
     def raster(self) -> tuple[int, int]:
         """Numbers of evenly spaced points along x and y that show its highest mode."""
-        points = (
-            math.ceil(2 * _POINTS_PER_DEGREE * side / self.shortest_wavelength)
-            for side in (self.length, self.width)
-        )
-        nx, ny = points
+        per_wavelength = 2 * _POINTS_PER_DEGREE
+        nx = math.ceil(per_wavelength * self.length / self.shortest_wavelength)
+        ny = math.ceil(per_wavelength * self.width / self.shortest_wavelength)
         return nx + 1, ny + 1
 
     @property
@@ -691,11 +737,6 @@ They have the same properties and methods.
 
 def stretched(mesh: PlateMesh, plate: Plate) -> PlateMesh:
     """A mesh of its kind that resolves the same on a plate of another size."""
-    nx, ny = (
-        math.ceil(count * max(new / old, 1.0))
-        for count, new, old in (
-            (mesh.nx, plate.length, mesh.length),
-            (mesh.ny, plate.width, mesh.width),
-        )
-    )
+    nx = math.ceil(mesh.nx * max(plate.length / mesh.length, 1.0))
+    ny = math.ceil(mesh.ny * max(plate.width / mesh.width, 1.0))
     return replace(mesh, nx=nx, ny=ny, length=plate.length, width=plate.width)

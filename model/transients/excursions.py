@@ -35,10 +35,19 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_summary import exciters_of
-from model.structure.attachments import PointLoad, footprints_of
+from model.structure.attachments import PointLoad, Source, footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
 from model.transients.time_response import PlateInTime, plate_in_time
+
+UP_TO, _STEP = 300.0, 10.0
+"""Highest frequency of a reach, and the step of frequencies [Hz]."""
+
+_MARGIN = 0.02
+"""Width of the strip along the edges [m] that is left out."""
+
+_SPACING = 0.012  # m
+_BATCH = 40  # positions solved together
 
 DECAYED = 0.25
 """Time [s] after which little is left of the magnets' free vibration."""
@@ -46,26 +55,40 @@ DECAYED = 0.25
 CLICKS_APART = 0.060
 """Least time [s] between the starts of clicks, at one finger or several; closer ones merge."""
 
+BOARDS, _SEED = 12, 4
+"""Number of drawn boards, and their seed."""
+
+_SIGMAS_OF_90_PERCENT = 1.28
+_SOFTEST = 0.1  # times the stiffness of the file
+_FAR_WITHIN = 1 / 3  # of the excursion
+
+_JUMP_STEP = 0.0005  # s; between samples after a jump
+_STEPS_AFTER = 20  # followed after the last knot
+_RAMP_STEPS = 64  # longer than every onset
+_KEPT, _SWINGS_KEPT = 16, 256  # sizes of caches
+_CHECKED = 1.0  # Hz; between frequencies of a rig that are checked
+_TINY = 1e-30
+
 _SWING_STEP = 0.002  # s; between samples: the beat with a magnet's own vibration takes 5 ms or more
 _PACES = 0.060  # s; from the shortest to the longest pause between repetitions
-_NEAR, _BESIDE = 1.5, 50.0  # near eigenvectors are below this multiple of a drive's, plus this [Hz]
+
+_NEAR, _NEAR_OFFSET = 1.5, 50.0
+"""Near eigenvectors are below this multiple of a drive's frequency, plus this offset [Hz]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Excursions:
-    """Excursions of each exciter at the rig's level [m], (n,).
-
-    - at_lowest: settled at its lowest frequency.
-    - largest: in onsets within all its limits, for exciters with a limit.
-    - passed (n,): whether these exceed the limits.
-    - allowed: lowest frequency [Hz] above which all stay within the limits up to the highest,
-      infinite if there is none.
-    """
+    """Excursions of n exciters at the rig's level."""
 
     at_lowest: FloatArray
+    """Settled excursion (n,) at the rig's lowest frequency [m]."""
     largest: FloatArray
+    """Largest excursion (n,) in onsets within all limits [m]; 0 for exciters without a limit."""
     passed: NDArray[np.bool_]
+    """Whether these exceed the exciters' limits (n,)."""
     allowed: float
+    """Lowest frequency [Hz] above which all stay within the limits up to the highest; infinite if
+    there is none."""
 
 
 @dataclass(frozen=True)
@@ -89,41 +112,55 @@ def motions_along(
     in the phases in which their motions add, and at the worst pace of repetition.
     """
     s = 2j * math.pi * frequency
-    settled = plate.following(np.array([s]))[0][0].T[:, :, None] * rows.T[:, None, :]
-    near = np.abs(plate.eigenvalues) < 2 * math.pi * (_NEAR * frequency + _BESIDE)
-    parts = math.ceil(swing.step / _SWING_STEP)
-    step, knots = swing.step / parts, len(swing.shares)
-    level = np.interp(np.arange(parts * (knots - 1) + 1) / parts, np.arange(knots), swing.shares)
-    rates: ComplexArray = plate.eigenvalues[near] - s
-    decays = np.exp(rates * step)
-    ends = 1 - (decays - 1) / (rates * step)
-    added = level[1:, None] * ends + level[:-1, None] * (1 - decays - ends)
-    follows = np.zeros((len(level), len(rates)), dtype=complex)
-    for number, each in enumerate(added, 1):
-        follows[number] = decays * follows[number - 1] + each
-    moved = np.tensordot(follows, settled[near], axes=1)
-    moved += level[:, None, None] * settled[~near].sum(axis=0)
+    settled = _settled_by_mode(plate, rows, s)
+    is_near = np.abs(plate.eigenvalues) < 2 * math.pi * (_NEAR * frequency + _NEAR_OFFSET)
+    level, step = _resampled(swing)
+    followed = _followed_level(plate.eigenvalues[is_near] - s, level, step)
+    moved = np.tensordot(followed, settled[is_near], axes=1)
+    moved += level[:, None, None] * settled[~is_near].sum(axis=0)
     largest = np.abs(moved).sum(axis=1).max(axis=0)
-    if swing.again < math.inf:  # phases continue from one to the next
+    if swing.again < math.inf:  # phases continue from one repetition to the next
         for pause in np.arange(swing.again, swing.again + _PACES, _SWING_STEP):
             count = math.ceil(pause / step)
-            spare = np.pad(moved, ((0, -len(moved) % count), (0, 0), (0, 0)))
-            anew = np.abs(spare.reshape(-1, count, *moved.shape[1:]).sum(axis=0))
-            largest = np.maximum(largest, anew.sum(axis=1).max(axis=0))
+            whole_periods = np.pad(moved, ((0, -len(moved) % count), (0, 0), (0, 0)))
+            by_period = whole_periods.reshape(-1, count, *moved.shape[1:])
+            repeated = np.abs(by_period.sum(axis=0))
+            largest = np.maximum(largest, repeated.sum(axis=1).max(axis=0))
     return np.asarray(largest)
 
 
-BOARDS, _SEED = 12, 4
-"""Number of drawn boards, and their seed."""
+def _settled_by_mode(plate: PlateInTime, rows: ComplexArray, s: complex) -> ComplexArray:
+    """Return the settled motion (2 r, eras, m) of magnets in each eigenvector, by each ERA.
 
-_NINE_OF_TEN = 1.28  # standard deviations for 90 %
-_SOFTEST = 0.1  # times the stiffness of the file
-_FAR_WITHIN = 1 / 3  # of the excursion
+    At full level and at s = i omega [1/s]; rows (m, 2 r): motion of each magnet in the
+    eigenvectors.
+    """
+    by_era, _ = plate.following(np.array([s]))
+    return np.asarray(by_era[0].T[:, :, None] * rows.T[:, None, :])
 
-_JUMP_STEP = 0.0005  # s; between samples after a jump
-_AFTER = 20  # steps that are followed after the last knot
-_KEPT, _SWINGS_KEPT = 16, 256  # sizes of caches
-_CHECKED = 1.0  # Hz; between frequencies of a rig that are checked
+
+def _resampled(swing: Swing) -> tuple[FloatArray, float]:
+    """Return the level (t,) of a swing at steps of at most _SWING_STEP, and the step [s]."""
+    parts = math.ceil(swing.step / _SWING_STEP)
+    knot_count = len(swing.shares)
+    positions = np.arange(parts * (knot_count - 1) + 1) / parts
+    level = np.interp(positions, np.arange(knot_count), swing.shares)
+    return level, swing.step / parts
+
+
+def _followed_level(rates: ComplexArray, level: FloatArray, step: float) -> ComplexArray:
+    """Return how far each eigenvector follows a level (t,), linear between steps [s]: (t, n).
+
+    rates (n,) [1/s]: eigenvalues relative to the drive. 1 once an eigenvector has settled at 1.
+    """
+    decays = np.exp(rates * step)
+    end_shares = 1 - (decays - 1) / (rates * step)
+    start_shares = 1 - decays - end_shares
+    added = level[1:, None] * end_shares + level[:-1, None] * start_shares
+    followed = np.zeros((len(level), len(rates)), dtype=complex)
+    for number, change in enumerate(added, 1):
+        followed[number] = decays * followed[number - 1] + change
+    return followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,16 +186,22 @@ class MagnetMotions:
 
         uncertainty: of the plate with its loads, None if it is exactly known.
         """
-        limits = np.array([each.excursion for each in plate.eras])
-        some = np.isfinite(limits)
-        drawn = _drawn(plate, uncertainty, loads) if uncertainty and some.any() else ()
-        rows = plate.stretches[some] @ plate.displacement
-        return cls(plate, rows, limits[some], tuple(cls.of(each) for each in drawn))
+        limits = np.array([era.excursion for era in plate.eras])
+        is_limited = np.isfinite(limits)
+        boards = list[MagnetMotions]()
+        if uncertainty and is_limited.any():
+            boards = [cls.of(board) for board in _drawn_boards(plate, uncertainty, loads)]
+        return cls(
+            plate=plate,
+            rows=plate.stretches[is_limited] @ plate.displacement,
+            excursions=limits[is_limited],
+            boards=tuple(boards),
+        )
 
     def allowed(self, *frequencies: float) -> FloatArray:
         """Return motions (f, m) [m] on the nominal board that keep 90 % of boards within the
         limits."""
-        return self.excursions / _further(self, frequencies)[:, None]
+        return self.excursions / _board_factors(self, frequencies)[:, None]
 
     def shares(self, frequencies: FloatArray) -> FloatArray:
         """Share (f,) of full level, 1 at most, to which all may jump at frequencies [Hz]."""
@@ -175,17 +218,17 @@ class MagnetMotions:
         """
         times = np.arange(0, DECAYED, _JUMP_STEP)
         decays = np.exp(np.outer(times, self.plate.eigenvalues))
-        found = []
+        magnet_count = len(self.rows)
+        largest = list[FloatArray]()
         for frequency in frequencies.tolist():
             s = 2j * math.pi * frequency
-            z = self.plate.following(np.array([s]))[0][0]
-            by_mode = (z.T[:, :, None] * self.rows.T[:, None, :]).reshape(z.shape[1], -1)
+            by_mode = _settled_by_mode(self.plate, self.rows, s).reshape(decays.shape[1], -1)
             settled = by_mode.sum(axis=0)
             free = np.exp(-s * times)[:, None] * (decays @ by_mode)
-            moved = np.abs(settled - free).reshape(len(times), -1, len(self.rows))
-            steady = np.abs(settled).reshape(-1, len(self.rows)).sum(axis=0)
-            found.append(np.maximum(moved.sum(axis=1).max(axis=0), steady))
-        return np.array(found)
+            moved = np.abs(settled - free).reshape(len(times), -1, magnet_count)
+            steady = np.abs(settled).reshape(-1, magnet_count).sum(axis=0)
+            largest.append(np.maximum(moved.sum(axis=1).max(axis=0), steady))
+        return np.array(largest)
 
     def within(self, frequency: float, knots: ComplexArray, *, full: float) -> ComplexArray:
         """Bring an envelope (n, eras) in full levels closer to a plain ramp, as far as necessary.
@@ -198,13 +241,14 @@ class MagnetMotions:
             return knots
         first, last = knots[0], knots[-1]
         part = max(np.abs(first).max(), np.abs(last).max()) / full
-        times = KNOT_STEP * np.arange(len(knots), dtype=float)
-        plain = first + rise(times, min(RISE, times[-1]))[:, None] * (last - first)
         (allowed,) = part * self.allowed(frequency)
-        moved, least = (self.largest(frequency, each) for each in (knots, plain))
+        moved = self.largest(frequency, knots)
         if (moved <= allowed).all():
             return knots
-        spare = np.maximum(allowed - least, 0) / np.maximum(moved - least, 1e-30)
+        times = KNOT_STEP * np.arange(len(knots), dtype=float)
+        plain = first + rise(times, min(RISE, times[-1]))[:, None] * (last - first)
+        moved_by_plain = self.largest(frequency, plain)
+        spare = np.maximum(allowed - moved_by_plain, 0) / np.maximum(moved - moved_by_plain, _TINY)
         kept = float(np.where(moved > allowed, spare, 1.0).min())
         return np.asarray(plain + kept * (knots - plain))
 
@@ -214,12 +258,12 @@ class MagnetMotions:
         Until time 0 the drives are steady at the first knot.
         """
         ramps, settled = _ramps_of(self, frequency)
-        count = (len(knots) + _AFTER) * SAMPLES
+        count = (len(knots) + _STEPS_AFTER) * SAMPLES
         moved = np.repeat((knots[0] @ settled)[None], count, axis=0)
         slopes = np.diff(knots, axis=0, prepend=knots[:1], append=knots[-1:])
-        for number, change in enumerate(np.diff(slopes, axis=0)):
-            since = number * SAMPLES
-            moved[since:] += np.tensordot(ramps[: count - since], change, axes=(1, 0))
+        for knot, change_of_slope in enumerate(np.diff(slopes, axis=0)):
+            start = knot * SAMPLES
+            moved[start:] += np.tensordot(ramps[: count - start], change_of_slope, axes=(1, 0))
         return np.asarray(np.abs(moved).max(axis=0))
 
 
@@ -231,50 +275,68 @@ def share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float
 
 
 @lru_cache(_SWINGS_KEPT)
-def _further(magnets: MagnetMotions, frequencies: tuple[float, ...]) -> FloatArray:
+def _board_factors(magnets: MagnetMotions, frequencies: tuple[float, ...]) -> FloatArray:
     """Return the factor by which magnets move further on 90 % of boards (f,), at least 1.
 
     1 if jumps to full level are far within the excursion.
     """
-    at, found = np.array(frequencies), np.ones(len(frequencies))
-    own = (magnets.by_jumps(at) / magnets.excursions).max(axis=1)
-    is_near = (own > _FAR_WITHIN) & bool(magnets.boards)
+    factors = np.ones(len(frequencies))
+    hertz = np.array(frequencies)
+    nominal = (magnets.by_jumps(hertz) / magnets.excursions).max(axis=1)
+    is_near = (nominal > _FAR_WITHIN) & bool(magnets.boards)
     if is_near.any():
-        moved = [(each.by_jumps(at[is_near]) / each.excursions) for each in magnets.boards]
-        ratios = np.log(np.array(moved).max(axis=2) / own[is_near])
-        last = ratios.mean(axis=0) + _NINE_OF_TEN * ratios.std(axis=0)
-        found[is_near] = np.exp(np.maximum(last, 0.0))
-    return found
+        moved = list[FloatArray]()
+        for board in magnets.boards:
+            moved.append((board.by_jumps(hertz[is_near]) / board.excursions).max(axis=1))
+        ratios = np.log(np.array(moved) / nominal[is_near])
+        last = ratios.mean(axis=0) + _SIGMAS_OF_90_PERCENT * ratios.std(axis=0)
+        factors[is_near] = np.exp(np.maximum(last, 0.0))
+    return factors
 
 
-def _drawn(
-    plate: PlateInTime, known: Uncertainty, loads: Sequence[PointLoad]
+def _drawn_boards(
+    plate: PlateInTime, uncertainty: Uncertainty, loads: Sequence[PointLoad]
 ) -> Iterator[PlateInTime]:
     """Yield boards within the uncertainty of a plate with loads, BOARDS at most."""
-    n, of = len(plate.eras), plate.reduced
-    numbers = np.random.default_rng(_SEED).standard_normal((BOARDS, 3 + 2 * n + len(loads)))
+    era_count = len(plate.eras)
+    rng = np.random.default_rng(_SEED)
+    numbers = rng.standard_normal((BOARDS, 3 + 2 * era_count + len(loads)))
     numbers = (numbers - numbers.mean(axis=0)) / numbers.std(axis=0)
     for drawn in numbers:
-        (q, loss, damping), own, gain, feet = np.split(drawn, [3, 3 + n, 3 + 2 * n])
-        springs = np.maximum(1 + known.stiffness * own, _SOFTEST)
-        softer = np.exp(known.supports * feet)
-        board = replace(
-            of,
-            plate=replace(of.plate, loss_factor=of.plate.loss_factor * known.damping**loss),
-            omega=of.omega * (1 + known.frequency * q),
-        )
-        eras = [
-            era.varied(stiffness=by, damping=known.damping**damping)
-            for era, by in zip(plate.eras, springs.tolist(), strict=True)
-        ]
-        resting = [
-            replace(load, stiffness=by * load.stiffness) if load.is_foot else load
-            for load, by in zip(loads, softer.tolist(), strict=True)
-        ]
         with suppress(InputError):  # nothing holds it
-            found = plate_in_time(board, eras, loads=resting)
-            driven = found.participation * (1 + known.gain * gain)
-            yield replace(found, participation=driven)
+            yield _board(plate, uncertainty, loads, drawn)
+
+
+def _board(
+    plate: PlateInTime,
+    uncertainty: Uncertainty,
+    loads: Sequence[PointLoad],
+    numbers: FloatArray,
+) -> PlateInTime:
+    """Return a board that differs from a plate by standard normal numbers (3 + 2 n + loads,)."""
+    nominal = plate.reduced
+    n = len(plate.eras)
+    (q, loss, damping), springs, gains, feet = np.split(numbers, [3, 3 + n, 3 + 2 * n])
+    loss_factor = nominal.plate.loss_factor * uncertainty.damping**loss
+    reduced = replace(
+        nominal,
+        plate=replace(nominal.plate, loss_factor=loss_factor),
+        omega=nominal.omega * (1 + uncertainty.frequency * q),
+    )
+    eras = list[Source]()
+    stiffness_factors = np.maximum(1 + uncertainty.stiffness * springs, _SOFTEST)
+    for era, factor in zip(plate.eras, stiffness_factors.tolist(), strict=True):
+        eras.append(era.varied(stiffness=factor, damping=uncertainty.damping**damping))
+    varied_loads = list[PointLoad]()
+    foot_factors = np.exp(uncertainty.supports * feet)
+    for load, factor in zip(loads, foot_factors.tolist(), strict=True):
+        if load.is_foot:
+            varied_loads.append(replace(load, stiffness=factor * load.stiffness))
+        else:
+            varied_loads.append(load)
+    board = plate_in_time(reduced, eras, loads=varied_loads)
+    participation = board.participation * (1 + uncertainty.gain * gains)
+    return replace(board, participation=participation)
 
 
 @lru_cache(_KEPT)
@@ -283,14 +345,18 @@ def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, C
 
     Long enough for every onset.
     """
-    plate, s = magnets.plate, 2j * math.pi * frequency
-    steady, slope = (each[0] for each in plate.following(np.array([s])))
-    a0, a1 = slope / KNOT_STEP, steady / KNOT_STEP
-    times = KNOT_STEP / SAMPLES * np.arange(64 * SAMPLES)
+    plate = magnets.plate
+    to_magnets = magnets.rows.T
+    s = 2j * math.pi * frequency
+    responses, by_s = plate.following(np.array([s]))
+    steady = responses[0]
+    a0 = by_s[0] / KNOT_STEP
+    a1 = steady / KNOT_STEP
+    times = KNOT_STEP / SAMPLES * np.arange(_RAMP_STEPS * SAMPLES)
     decay = np.exp(np.outer(times, plate.eigenvalues - s))
-    free = np.stack([(decay * row) @ magnets.rows.T for row in a0], axis=1)
-    ramps = a0 @ magnets.rows.T + times[:, None, None] * (a1 @ magnets.rows.T) - free
-    return np.asarray(ramps), np.asarray(steady @ magnets.rows.T)
+    free = np.stack([(decay * by_era) @ to_magnets for by_era in a0], axis=1)
+    ramps = a0 @ to_magnets + times[:, None, None] * (a1 @ to_magnets) - free
+    return np.asarray(ramps), np.asarray(steady @ to_magnets)
 
 
 def magnets_of(rig: Rig, free: FreePlate) -> MagnetMotions:
@@ -306,47 +372,45 @@ def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> Comp
     For each actuator at full level: T (w - y), with the plate's motion w and the base y equivalent
     to the current (`Exciter.base`). free: the rig's plate. Without fingers: they reduce it.
     """
-    exciters, omega = exciters_of(rig), 2 * np.pi * frequencies
-    places = np.array([[one.x, one.y] for one in exciters])
-    fields = free.acceleration(rig.eras, frequencies, places, loads=rig.masses)
+    exciters = exciters_of(rig)
+    omega = 2 * np.pi * frequencies
+    positions = np.array([[exciter.x, exciter.y] for exciter in exciters])
+    fields = free.acceleration(rig.eras, frequencies, positions, loads=rig.masses)
     moved = fields / -(omega**2)[:, None, None]
-    for number, one in enumerate(exciters):
-        moved[:, rig.eras.index(one), number] -= one.base(omega)
-        moved[:, :, number] = one.excursion_by(omega, moved[:, :, number])
+    for number, exciter in enumerate(exciters):
+        moved[:, rig.eras.index(exciter), number] -= exciter.base(omega)
+        moved[:, :, number] = exciter.excursion_by(omega, moved[:, :, number])
     return moved
 
 
 def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
     """Compute the excursions at the rig's frequencies and level; free: its plate, if solved."""
-    limits, exciters = rig.limits, exciters_of(rig)
+    limits = rig.limits
+    exciters = exciters_of(rig)
     low, high = limits.frequency_min, limits.frequency_max
     frequencies = np.append(np.arange(low, high, _CHECKED), high)
     free = free or solve_free_plate(rig.plate, rig.mesh, frequency_max=high)
     settled = np.abs(relative_motions(rig, free, frequencies[:1])).sum(axis=1)[0]
     largest = np.zeros((len(frequencies), len(exciters)))
-    some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]
-    if some:
+    excursions = np.array([exciter.excursion for exciter in exciters])
+    is_limited = np.isfinite(excursions)
+    if is_limited.any():
         magnets = magnets_of(rig, free)
-        further = magnets.excursions / magnets.allowed(*frequencies.tolist())
-        largest[:, some] = limits.level * further * magnets.by_jumps(frequencies)
-    passed = largest > np.array([one.excursion for one in exciters])
+        board_factors = magnets.excursions / magnets.allowed(*frequencies.tolist())
+        by_jumps = magnets.by_jumps(frequencies)
+        largest[:, is_limited] = limits.level * board_factors * by_jumps
+    passed = largest > excursions
     rows = np.flatnonzero(passed.any(axis=1))
     allowed = low
     if len(rows):
-        allowed = float(frequencies[rows[-1] + 1]) if rows[-1] + 1 < len(passed) else math.inf
+        next_row = rows[-1] + 1
+        allowed = float(frequencies[next_row]) if next_row < len(passed) else math.inf
     return Excursions(
-        limits.level * settled, largest.max(axis=0), np.asarray(passed.any(axis=0)), allowed
+        at_lowest=limits.level * settled,
+        largest=largest.max(axis=0),
+        passed=np.asarray(passed.any(axis=0)),
+        allowed=allowed,
     )
-
-
-_MARGIN = 0.02
-"""Width of the strip along the edges [m] that is left out."""
-
-UP_TO, _STEP = 300.0, 10.0
-"""Highest frequency of a reach, and the step of frequencies [Hz]."""
-
-_SPACING = 0.012  # m
-_AT_ONCE = 40  # places
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,61 +443,73 @@ class Reach:
 
 def reach_of(rig: Rig, free: FreePlate) -> Reach:
     """Compute the reach of a rig within its limits, up to UP_TO; free: the rig's plate."""
-    plate, limits = rig.plate, rig.limits
+    plate = rig.plate
+    limits = rig.limits
     low = limits.frequency_min
-    frequencies = np.arange(low, min(limits.frequency_max, max(UP_TO, low)) + 1e-9, _STEP)
-    margins = [(side, min(_MARGIN, side / 4)) for side in (plate.length, plate.width)]
-    places = lattice(
-        *(
-            np.linspace(edge, side - edge, 1 + math.ceil((side - 2 * edge) / _SPACING))
-            for side, edge in margins
-        )
-    )
+    high = min(limits.frequency_max, max(UP_TO, low))
+    frequencies = np.arange(low, high + 1e-9, _STEP)
+    positions = lattice(_positions_along(plate.length), _positions_along(plate.width))
     level = np.minimum(magnets_of(rig, free).shares(frequencies), limits.level)[:, None]
     threshold = detection_threshold(frequencies, rig.threshold)[:, None]
-    found = []
-    for few in np.array_split(places, math.ceil(len(places) / _AT_ONCE)):
+    ratios = list[FloatArray]()
+    for batch in np.array_split(positions, math.ceil(len(positions) / _BATCH)):
         points, weights = fingertips_on(
-            few, length=plate.length, width=plate.width, rule=FIVE_POINTS
+            batch, length=plate.length, width=plate.width, rule=FIVE_POINTS
         )
-        fields = free.acceleration(
-            rig.eras, frequencies, points.reshape(-1, 2), loads=rig.masses
-        ).reshape(len(frequencies), len(rig.eras), *weights.shape)
-        phases = fields[..., 0].conj() / np.abs(fields[..., 0])
-        together = np.abs((fields * phases[..., None]).sum(axis=1))
-        felt = level * (together * weights).sum(axis=-1)
-        found.append(felt / _held(rig, free, few, frequencies) / threshold)
-    levels = decibels(np.concatenate(found, axis=1))
-    return Reach(frequencies, levels.min(axis=1), (levels >= STRONG_DB_SL).mean(axis=1))
+        fields = free.acceleration(rig.eras, frequencies, points.reshape(-1, 2), loads=rig.masses)
+        fields = fields.reshape(len(frequencies), len(rig.eras), *weights.shape)
+        at_centre = fields[..., 0]
+        phases = at_centre.conj() / np.abs(at_centre)
+        in_phase = np.abs((fields * phases[..., None]).sum(axis=1))
+        felt = level * (in_phase * weights).sum(axis=-1)
+        ratios.append(felt / _finger_reductions(rig, free, batch, frequencies) / threshold)
+    levels = decibels(np.concatenate(ratios, axis=1))
+    return Reach(
+        frequencies=frequencies,
+        least_db_sl=levels.min(axis=1),
+        shares=(levels >= STRONG_DB_SL).mean(axis=1),
+    )
 
 
-def _held(rig: Rig, free: FreePlate, places: FloatArray, frequencies: FloatArray) -> FloatArray:
+def _positions_along(side: float) -> FloatArray:
+    """Return evenly spaced positions (n,) along a side, all in [m], without its ends."""
+    margin = min(_MARGIN, side / 4)
+    count = 1 + math.ceil((side - 2 * margin) / _SPACING)
+    return np.linspace(margin, side - margin, count)
+
+
+def _finger_reductions(
+    rig: Rig, free: FreePlate, positions: FloatArray, frequencies: FloatArray
+) -> FloatArray:
     """Return the factor (f, p) by which a finger reduces the motion at its position, 1 + D R."""
     if rig.fingertip is None:
-        return np.ones((len(frequencies), len(places)))
+        return np.ones((len(frequencies), len(positions)))
     attached = (*rig.eras, *rig.masses)
-    between, _ = free.receptances(places, places[:1], frequencies, loads=attached)
+    between, _ = free.receptances(positions, positions[:1], frequencies, loads=attached)
     stiffness = rig.fingertip.dynamic_stiffness(2 * np.pi * frequencies)
-    own = np.diagonal(between, axis1=-2, axis2=-1)
-    return np.abs(1 + stiffness[:, None] * own)
+    receptance = np.diagonal(between, axis1=-2, axis2=-1)
+    return np.abs(1 + stiffness[:, None] * receptance)
 
 
 def excursion_notes(rig: Rig) -> Iterator[str]:
     """Yield a warning where full level would move magnets beyond their excursion."""
-    exciters, limits = exciters_of(rig), rig.limits
-    found = excursions_of(rig) if exciters else None
-    if found is None or not found.passed.any():
+    exciters = exciters_of(rig)
+    if not exciters:
         return
-    shares = found.largest / [one.excursion for one in exciters]
+    excursions = excursions_of(rig)
+    if not excursions.passed.any():
+        return
+    limits = rig.limits
+    shares = excursions.largest / [exciter.excursion for exciter in exciters]
     worst = int(shares.argmax())
-    names = [one.name for one, is_far in zip(exciters, found.passed, strict=True) if is_far]
-    lowest = (
-        f"within from {found.allowed:g} Hz on" if np.isfinite(found.allowed) else "nowhere within"
-    )
+    names = [exciters[number].name for number in np.flatnonzero(excursions.passed)]
+    lowest = "nowhere within"
+    if np.isfinite(excursions.allowed):
+        lowest = f"within from {excursions.allowed:g} Hz on"
     yield (
         f"limits.frequency: from {limits.frequency_min:g} Hz on limits.level {limits.level:g} can "
         f"move the magnets of {', '.join(names)} beyond their excursion ("
-        f"{exciters[worst].name} to {1e3 * found.largest[worst]:.2g} mm of "
+        f"{exciters[worst].name} to {1e3 * excursions.largest[worst]:.2g} mm of "
         f"{1e3 * exciters[worst].excursion:.2g} mm; {lowest}). Answers play less there, manual "
         "tones do not: a level of at most "
         f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g} is safe"

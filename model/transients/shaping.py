@@ -33,7 +33,7 @@ from model.finger import (
     fingertips_on,
     is_background,
 )
-from model.transients.base_motion import BaseEnvelope, BaseMotions, Bases, Envelopes
+from model.transients.base_motion import BaseEnvelope, BaseMotions, Bases, Envelopes, Term
 from model.transients.excursions import MagnetMotions
 from model.transients.knots import (
     Carrier,
@@ -45,7 +45,7 @@ from model.transients.knots import (
     steady_states,
 )
 from model.transients.time_response import ForcedVibration, PlateInTime
-from model.vibration import Excitation, base_amplitudes
+from model.vibration import Excitation, Tone, base_amplitudes
 
 ONSET_WINDOW = 0.100
 """Time [s] from the first motion over which an onset is measured."""
@@ -60,10 +60,10 @@ _FINE = 32  # samples; about the square root of their number in an onset
 
 
 class _Piece(NamedTuple):
-    """An interval [s] without changes of the drives."""
+    """An interval without changes of the drives."""
 
-    since: float
-    until: float
+    start: float  # s
+    end: float  # s
     forced: ForcedVibration
     number: int  # of its forced solution
     free: ComplexArray  # z of the free part at its start
@@ -77,9 +77,8 @@ class Transients:
         self._plate = plate
         times = np.arange(round(ONSET_WINDOW * SAMPLE_RATE)) / SAMPLE_RATE
         # Products of a coarse and a fine step: an exponential costs ten times as much.
-        coarse, fine = (
-            np.exp(np.outer(part, plate.eigenvalues)) for part in (times[::_FINE], times[:_FINE])
-        )
+        coarse = np.exp(np.outer(times[::_FINE], plate.eigenvalues))
+        fine = np.exp(np.outer(times[:_FINE], plate.eigenvalues))
         exponentials = (coarse[:, None] * fine).reshape(-1, len(plate.eigenvalues))
         self._exponentials = np.hstack([exponentials.real, exponentials.imag])[: len(times)]
 
@@ -100,11 +99,12 @@ class Transients:
         to the loudest quiet point; positions in m.
         """
         plate = self._plate.reduced.plate
-        discs = [fingertip_points(*each, plate) for each in (*targets, *quiet)]
-        acceleration = felt_part(self.acceleration(bases, np.concatenate(discs)), SAMPLE_RATE)
+        discs = [fingertip_points(*position, plate) for position in (*targets, *quiet)]
+        acceleration = self.acceleration(bases, np.concatenate(discs))
+        felt = felt_part(acceleration, SAMPLE_RATE)
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
-        peaks = np.split(np.abs(acceleration).max(axis=0), ends)
-        weights = [fingertip_weights(*each, plate) for each in targets]
+        peaks = np.split(np.abs(felt).max(axis=0), ends)
+        weights = [fingertip_weights(*target, plate) for target in targets]
         count = len(targets)
         return float(contrast_db(peaks[:count], np.concatenate(peaks[count:]), weights))
 
@@ -127,17 +127,17 @@ class Transients:
         free_shapes = (shapes @ plate.acceleration).T
         forced_shapes = (shapes @ plate.displacement).T
         for piece in self._pieces(bases, self._steady(after or {}), duration):
-            first, last = np.searchsorted(times, [piece.since, piece.until]).tolist()
+            first, last = np.searchsorted(times, [piece.start, piece.end]).tolist()
             acceleration[first:last] = piece.forced.acceleration(
                 piece.number, times[first:last], forced_shapes
             )
             for start in range(first, last, len(self._exponentials)):
                 stop = min(last, start + len(self._exponentials))
-                now = piece.free * np.exp(plate.eigenvalues * (times[start] - piece.since))
-                free = now[:, None] * free_shapes
-                acceleration[start:stop] += self._exponentials[: stop - start] @ np.vstack(
-                    [free.imag, free.real]
-                )
+                elapsed = times[start] - piece.start
+                state = piece.free * np.exp(plate.eigenvalues * elapsed)
+                free = state[:, None] * free_shapes
+                parts = np.vstack([free.imag, free.real])
+                acceleration[start:stop] += self._exponentials[: stop - start] @ parts
         return acceleration
 
     def residual_db(self, excitation: Excitation, ending: Bases) -> float:
@@ -149,22 +149,24 @@ class Transients:
         """
         end_time = max((term.end for base in ending for term in base), default=0.0)
         frequencies = sorted({tone.frequency for tone in excitation.values()})
-        played = [
-            excitation[era.name].frequency if era.name in excitation else frequencies[0]
-            for era in self._plate.eras
-        ]
+        plate_size = len(self._plate.reduced.omega)
         remaining = power = 0.0
         for frequency in frequencies:
-            own = {name: tone for name, tone in excitation.items() if tone.frequency == frequency}
-            bases = tuple(
-                base if each == frequency else () for each, base in zip(played, ending, strict=True)
-            )
-            left = steady = self._steady(own)
-            for piece in self._pieces(bases, steady, end_time):
-                left = piece.last
-            remaining += float((left.conj() @ self._mean_square @ left).real)
-            moved = (self._plate.displacement @ steady)[: len(self._plate.reduced.omega)]
-            size = float(np.linalg.norm(moved))
+            tones: dict[str, Tone] = {}
+            bases = list[tuple[Term, ...]]()
+            for era, base in zip(self._plate.eras, ending, strict=True):
+                tone = excitation.get(era.name)
+                era_frequency = frequencies[0] if tone is None else tone.frequency
+                if tone is not None and tone.frequency == frequency:
+                    tones[era.name] = tone
+                bases.append(base if era_frequency == frequency else ())
+            steady = self._steady(tones)
+            last = steady
+            for piece in self._pieces(tuple(bases), steady, end_time):
+                last = piece.last
+            remaining += float((last.conj() @ self._mean_square @ last).real)
+            displacement = (self._plate.displacement @ steady)[:plate_size]
+            size = float(np.linalg.norm(displacement))
             power += (2 * math.pi * frequency) ** 4 * size**2
         return 10 * math.log10(remaining / power)
 
@@ -173,11 +175,11 @@ class Transients:
         motions = BaseMotions(bases)
         edges = sorted({0.0, *motions.moments(0, 0.0, duration), duration})
         forced = self._plate.driven(motions, [0] * len(edges), edges)
-        for number, (since, until) in enumerate(pairwise(edges)):
-            before, after = forced.modal([number, number], [since, until])
-            free = total - before
-            total = after + free * np.exp(self._plate.eigenvalues * (until - since))
-            yield _Piece(since, until, forced, number, free, total)
+        for number, (start, end) in enumerate(pairwise(edges)):
+            forced_at_start, forced_at_end = forced.modal([number, number], [start, end])
+            free = total - forced_at_start
+            total = forced_at_end + free * np.exp(self._plate.eigenvalues * (end - start))
+            yield _Piece(start, end, forced, number, free, last=total)
 
     def _steady(self, excitation: Excitation) -> ComplexArray:
         """Return the steady state z (2 r,) at time 0, the reference of phases."""
@@ -193,8 +195,8 @@ class Transients:
 _SURROUNDINGS = Grid(8, 6)  # twice as fine changes the contrast by 0.1 dB
 _KEPT = 16  # sizes of caches: an onset and its ending share readings, as do resting fingers
 
-# Least number of combinations of ERAs in an onset; there are more for more than six quiet fingers.
-# With all of sixteen the contrast is lower, with six of eight 1 dB lower in one of ten cases.
+# Minimum number of combinations of ERAs in an onset; more than six quiet fingers get more. With all
+# of sixteen the contrast is lower. Six of eight lower it by 1 dB in 10 % of the cases.
 _COMBINATIONS = 8
 
 _COMBINATIONS_ALONE = 6  # the same without quiet fingers
@@ -229,9 +231,7 @@ class Shaper:
         self._names = [era.name for era in plate.eras]
         self._strokes = np.array([era.full_level for era in plate.eras])
         self._magnets = magnets or MagnetMotions.of(plate)
-        self._full = lru_cache(_KEPT)(
-            lambda hertz: float(self._magnets.shares(np.array([hertz]))[0])
-        )
+        self._full_share = lru_cache(_KEPT)(self._magnet_share)
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
@@ -267,8 +267,9 @@ class Shaper:
         """
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
-            found = of_eras(self._felt(frequency, tuple(targets), tuple(quiet)), active)
-            knots = onset_knots(amplitudes[active], found, self._gain_variance)
+            felt = self._felt(frequency, tuple(targets), tuple(quiet))
+            responses = of_eras(felt, active)
+            knots = onset_knots(amplitudes[active], responses, self._gain_variance)
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
 
@@ -286,23 +287,30 @@ class Shaper:
         """
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=False):
-            found = None
+            responses = None
             if targets and quiet:
-                found = of_eras(self._felt(frequency, tuple(targets), tuple(quiet)), active)
-            knots = ending_knots(self.prepare(frequency), amplitudes, active, found)
+                felt = self._felt(frequency, tuple(targets), tuple(quiet))
+                responses = of_eras(felt, active)
+            knots = ending_knots(self.prepare(frequency), amplitudes, active, responses)
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
 
     def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:
         """Make envelopes from start and knots (n, active) in strokes, as far as magnets allow."""
-        every = np.zeros((len(knots), len(self._strokes)), dtype=complex)
-        every[:, active] = knots
-        knots = self._magnets.within(frequency, every, full=self._full(frequency))[:, active]
-        by_era = zip(active.tolist(), (knots * self._strokes[active]).T.tolist(), strict=True)
-        return {
-            self._names[era]: BaseEnvelope(frequency, start, tuple(rest))
-            for era, (start, *rest) in by_era
-        }
+        all_knots = np.zeros((len(knots), len(self._strokes)), dtype=complex)
+        all_knots[:, active] = knots
+        full = self._full_share(frequency)
+        limited = self._magnets.within(frequency, all_knots, full=full)
+        bases = limited * self._strokes
+        envelopes: dict[str, BaseEnvelope] = {}
+        for era in active.tolist():
+            start, *later = bases[:, era].tolist()
+            envelopes[self._names[era]] = BaseEnvelope(frequency, start, tuple(later))
+        return envelopes
+
+    def _magnet_share(self, frequency: float) -> float:
+        """Return the share of full level to which drives may jump at a frequency [Hz]."""
+        return float(self._magnets.shares(np.array([frequency]))[0])
 
     def _groups(
         self, excitation: Excitation, *, helped: bool
@@ -312,13 +320,14 @@ class Shaper:
         helped: whether silent ERAs play, too, if there is only one frequency.
         """
         frequencies, phasors = base_amplitudes(excitation, self._plate.eras)
-        helped = helped and len(frequencies) == 1
-        return [
-            (frequency, amplitudes, np.flatnonzero((amplitudes != 0) | helped))
-            for frequency, amplitudes in zip(
-                frequencies.tolist(), phasors / self._strokes, strict=True
-            )
-        ]
+        all_play = helped and len(frequencies) == 1
+        groups = list[tuple[float, ComplexArray, IntArray]]()
+        for frequency, amplitudes in zip(
+            frequencies.tolist(), phasors / self._strokes, strict=True
+        ):
+            is_active = (amplitudes != 0) | all_play
+            groups.append((frequency, amplitudes, np.flatnonzero(is_active)))
+        return groups
 
     def _read(
         self, frequency: float, targets: tuple[Point, ...], quiet: tuple[Point, ...]
@@ -327,11 +336,11 @@ class Shaper:
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
         if quiet:
-            others = self._resting(quiet)
+            quiet_rows = self._resting(quiet)
         else:  # the plate beyond 50 mm of all targets, or all of a small plate
-            around = self._shapes[is_background(self._centres, targets)]
-            others = around / math.sqrt(len(around))
-        return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
+            background = self._shapes[is_background(self._centres, targets)]
+            quiet_rows = background / math.sqrt(len(background))
+        return responses_at(self.prepare(frequency), means, quiet_rows, is_alone=not quiet)
 
     def _quiet_rows(self, positions: tuple[Point, ...]) -> FloatArray:
         """Return rows (d, r) whose sum of squares is the sum of the fingertips' mean squares."""
@@ -340,17 +349,18 @@ class Shaper:
 
     def _fingertips(self, positions: tuple[Point, ...]) -> tuple[FloatArray, FloatArray]:
         """Return weights (k, p) of points under fingertips and their shapes (k, p, r)."""
-        known = self._fingers
+        cache = self._fingers
         # Looked up first, since other threads drop some.
-        found = dict(zip(positions, map(known.get, positions), strict=True))
-        if new := [each for each, one in found.items() if one is None]:
-            weights, shapes = self._read_fingertips(new)
-            made = dict(zip(new, zip(weights, shapes, strict=True), strict=True))
-            found.update(made)
-            known.update(made)
-        for each in [*known][:-_KEPT]:
-            known.pop(each, None)
-        weights, shapes = map(np.stack, zip(*map(found.__getitem__, positions), strict=True))
+        readings = {position: cache.get(position) for position in positions}
+        missing = [position for position, reading in readings.items() if reading is None]
+        if missing:
+            weights, shapes = self._read_fingertips(missing)
+            new = dict(zip(missing, zip(weights, shapes, strict=True), strict=True))
+            readings.update(new)
+            cache.update(new)
+        for position in [*cache][:-_KEPT]:
+            cache.pop(position, None)
+        weights, shapes = map(np.stack, zip(*map(readings.__getitem__, positions), strict=True))
         return weights, self._plate.with_far_ends(shapes)
 
 
@@ -364,25 +374,32 @@ def responses_at(
     """
     rows = np.vstack([target_rows, quiet_rows])
     samples, r, knots, eras = carrier.hats.shape
-    flat = carrier.hats.reshape(samples, r, -1).view(np.float32)
-    hats = (rows.astype(np.float32) @ flat).view(np.complex64)
-    hats = hats.reshape(samples, len(rows), knots, eras)
-    combinations = _COMBINATIONS_ALONE if is_alone else max(_COMBINATIONS, len(rows) // 4)
-    return FingerResponses(len(target_rows), hats, rows @ carrier.steady.T, combinations)
+    reals = carrier.hats.reshape(samples, r, -1).view(np.float32)
+    hats = (rows.astype(np.float32) @ reals).view(np.complex64)
+    return FingerResponses(
+        targets=len(target_rows),
+        hats=hats.reshape(samples, len(rows), knots, eras),
+        steady=rows @ carrier.steady.T,
+        combinations=_COMBINATIONS_ALONE if is_alone else max(_COMBINATIONS, len(rows) // 4),
+    )
 
 
-def of_eras(found: FingerResponses, active: IntArray) -> FingerResponses:
+def of_eras(responses: FingerResponses, active: IntArray) -> FingerResponses:
     """Select the responses of active ERAs."""
-    if len(active) == found.steady.shape[1]:
-        return found
-    hats, steady = map(np.ascontiguousarray, (found.hats[..., active], found.steady[:, active]))
-    return replace(found, hats=hats, steady=steady)
+    if len(active) == responses.steady.shape[1]:
+        return responses
+    return replace(
+        responses,
+        hats=np.ascontiguousarray(responses.hats[..., active]),
+        steady=np.ascontiguousarray(responses.steady[:, active]),
+    )
 
 
 def _fingertips_on(plate: PlateInTime, positions: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
     """Read the shapes of a plate under fingertips point by point, as `Fingertips`."""
-    on = plate.reduced.plate
+    sides = plate.reduced.plate
     points, weights = fingertips_on(
-        np.array(positions), length=on.length, width=on.width, rule=FIVE_POINTS
+        np.array(positions), length=sides.length, width=sides.width, rule=FIVE_POINTS
     )
-    return weights, plate.shapes_at(points.reshape(-1, 2)).reshape(*weights.shape, -1)
+    shapes = plate.shapes_at(points.reshape(-1, 2))
+    return weights, shapes.reshape(*weights.shape, -1)

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import Complex64Array, ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, stretches
 from model.structure.attachments import (
@@ -81,7 +81,8 @@ class ForcedVibration:
 
     def as_free(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
         """Return z (j, m) of free vibrations in the state of solutions (j,) at times (j,) [s]."""
-        z, half = self.modal(numbers, times), self.plate.half
+        z = self.modal(numbers, times)
+        half = self.plate.half
         # The conjugate of an eigenvector belongs to the conjugate eigenvalue, which LAPACK stores
         # behind each eigenvalue above the real axis; a real one is its own conjugate.
         partner = half + (self.plate.decay.imag > 0)
@@ -90,14 +91,16 @@ class ForcedVibration:
     def acceleration(self, number: int, times: FloatArray, shapes: ComplexArray) -> FloatArray:
         """Return the acceleration (n, p) in a solution at times (n,) [s]; shapes (2 r, p): by z."""
         rows = self.rows(number)
-        s, tau = 1j * self.omegas[rows], times[:, None] - self.times[number]
+        tau = times[:, None] - self.times[number]
+        s = 1j * self.omegas[rows]
+        s_squared = s[:, None] ** 2
         phase_factor = np.exp(s * tau)
-        constant = s[:, None] ** 2 * self.a0[rows]
+        constant = s_squared * self.a0[rows]
         if self.a1 is None:
             return np.asarray((phase_factor @ (constant @ shapes)).imag)
         growth = self.a1[rows]
         constant += 2 * s[:, None] * growth
-        growing = (tau * phase_factor) @ (s[:, None] ** 2 * growth @ shapes)
+        growing = (tau * phase_factor) @ (s_squared * growth @ shapes)
         return np.asarray((phase_factor @ (constant @ shapes) + growing).imag)
 
     def modal(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
@@ -142,8 +145,11 @@ class PlateInTime:
 
         These come first; magnets and phalanges are not on the plate and have shape 0.
         """
-        others = len(self.vectors) // 2 - shapes.shape[-1]
-        return np.pad(shapes, (*[(0, 0)] * (shapes.ndim - 1), (0, others))) if others else shapes
+        far_end_count = len(self.vectors) // 2 - shapes.shape[-1]
+        if not far_end_count:
+            return shapes
+        padding = [(0, 0)] * (shapes.ndim - 1)
+        return np.pad(shapes, (*padding, (0, far_end_count)))
 
     @cached_property
     def displacement(self) -> ComplexArray:
@@ -158,38 +164,48 @@ class PlateInTime:
         Each is for the terms that move the ERAs' bases at its time. Terms with the same frequency
         are added, so that the cost of samples depends only on the number of frequencies.
         """
-        moments = np.array(times, dtype=float)
-        number, active = motions.active(numbers, moments).nonzero()
-        era, each = motions.era[active], motions.omega[active]
-        tau, s = moments[number] - motions.start[active], 1j * each
-        phase_factor = np.exp(s * tau)
-        c = self.by_rate[era]
-        impedance = self.by_drive[era] + c * s  # force by displacement, or by voltage
-        is_first = np.ones(len(each), dtype=bool)
-        is_first[1:] = (each[1:] != each[:-1]) | (number[1:] != number[:-1])
-        omegas = each[is_first]
+        start_times = np.array(times, dtype=float)
+        solution, term = motions.active(numbers, start_times).nonzero()
+        era = motions.era[term]
+        omega = motions.omega[term]
+        s = 1j * omega
+        tau = start_times[solution] - motions.start[term]
+        is_first = np.ones(len(term), dtype=bool)
+        is_first[1:] = (omega[1:] != omega[:-1]) | (solution[1:] != solution[:-1])
+        distinct_omegas = omega[is_first]
         # By frequency and ERA, as forces on the base.
         cell = (is_first.cumsum() - 1) * len(self.eras) + era
-        receptance = 1 / (1j * omegas[:, None] - self.eigenvalues)
-        y, a1 = phase_factor * motions.c0[active], None
+        receptance = 1 / (1j * distinct_omegas[:, None] - self.eigenvalues)
+        by_rate = self.by_rate[era]
+        impedance = self.by_drive[era] + by_rate * s  # force by displacement, or by voltage
+        phase_factor = np.exp(s * tau)
+        base = phase_factor * motions.c0[term]
+        a1 = None
         if motions.c1 is None:
-            a0 = self._by_forces(cell, impedance * y, omegas) * receptance
+            a0 = self._by_forces(cell, impedance * base, distinct_omegas) * receptance
         else:
-            growth = phase_factor * motions.c1[active]
-            a1 = self._by_forces(cell, impedance * growth, omegas) * receptance
-            force = impedance * (y + growth * tau) + c * growth
-            a0 = (self._by_forces(cell, force, omegas) - a1) * receptance
-        return ForcedVibration(self, moments, number[is_first], omegas, a0, a1)
+            growth = phase_factor * motions.c1[term]
+            a1 = self._by_forces(cell, impedance * growth, distinct_omegas) * receptance
+            force = impedance * (base + growth * tau) + by_rate * growth
+            a0 = (self._by_forces(cell, force, distinct_omegas) - a1) * receptance
+        return ForcedVibration(
+            plate=self,
+            times=start_times,
+            number=solution[is_first],
+            omegas=distinct_omegas,
+            a0=a0,
+            a1=a1,
+        )
 
     def _by_forces(
         self, cell: NDArray[np.intp], forces: ComplexArray, omegas: FloatArray
     ) -> ComplexArray:
         """Return z' (n, 2 r) at n omegas by forces [N] in cells, numbered by omega and ERA."""
         shape = len(omegas), len(self.eras)
-        size = shape[0] * shape[1]
+        cell_count = math.prod(shape)
         summed = np.empty(shape, dtype=complex)
-        summed.real = np.bincount(cell, forces.real, size).reshape(shape)
-        summed.imag = np.bincount(cell, forces.imag, size).reshape(shape)
+        summed.real = np.bincount(cell, forces.real, cell_count).reshape(shape)
+        summed.imag = np.bincount(cell, forces.imag, cell_count).reshape(shape)
         for number, era in enumerate(self.eras):
             if era.gains:
                 summed[:, number] *= era.gain(omegas / (2 * np.pi))
@@ -258,7 +274,8 @@ class PlateInTime:
     @cached_property
     def free_state(self) -> ComplexArray:
         """Matrix (2 r, m): displacement and velocity of a free vibration are Re[free_state @ z]."""
-        return self.vectors[:, self.half] * np.where(self.eigenvalues.imag > 0, 2.0, 1.0)[self.half]
+        is_one_of_pair = self.eigenvalues[self.half].imag > 0
+        return self.vectors[:, self.half] * np.where(is_one_of_pair, 2.0, 1.0)
 
     @cached_property
     def free_acceleration(self) -> ComplexArray:
@@ -269,6 +286,10 @@ class PlateInTime:
     def to_free(self) -> ComplexArray:
         """Matrix (m, 2 r): z of a free vibration is to_free @ its displacement and velocity."""
         return self.inverse[self.half]
+
+
+_SEPARATED = 1e-6
+"""Largest residual of the eigenvectors, relative to the largest coefficient of the equations."""
 
 
 def plate_in_time(
@@ -292,29 +313,30 @@ def plate_in_time(
     )
     r = len(K)
     # NumPy's solvers let other threads run meanwhile; SciPy's do not.
-    inverse = np.linalg.inv(M)
-    A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
+    inverse_mass = np.linalg.inv(M)
+    velocities = [np.zeros((r, r)), np.eye(r)]
+    accelerations = [-inverse_mass @ K, -inverse_mass @ C]
+    A = np.block([velocities, accelerations])
     eigenvalues, vectors = np.linalg.eig(A)
     inverse_vectors = _inverse(vectors)
     residual = np.abs((vectors * eigenvalues) @ inverse_vectors - A).max()
-    if not residual < 1e-6 * np.abs(A).max():
+    if not residual < _SEPARATED * np.abs(A).max():  # False for NaN
         raise InputError(
             "the plate's equations of motion cannot be separated into modes: a mode is damped "
             "critically; change an ERA's damping by a per mille"
         )
-    parts = [era.in_time for era in eras]
-    pushed = stretches(parts, attachment_shapes[: len(eras)])
-    input_shapes = np.pad(pushed, ((0, 0), (0, r - pushed.shape[1])))
-    forced: ComplexArray = inverse_vectors[:, r:] @ inverse
+    era_stretches = stretches([era.in_time for era in eras], attachment_shapes[: len(eras)])
+    input_shapes = np.pad(era_stretches, ((0, 0), (0, r - era_stretches.shape[1])))
+    forced: ComplexArray = inverse_vectors[:, r:] @ inverse_mass
     return PlateInTime(
-        reduced,
-        tuple(eras),
-        eigenvalues,
-        vectors,
-        inverse_vectors,
-        np.asarray(forced @ input_shapes.T, dtype=complex),
-        forced,
-        input_shapes,
+        reduced=reduced,
+        eras=tuple(eras),
+        eigenvalues=eigenvalues,
+        vectors=vectors,
+        inverse=inverse_vectors,
+        participation=np.asarray(forced @ input_shapes.T, dtype=complex),
+        forced=forced,
+        stretches=input_shapes,
     )
 
 
@@ -349,19 +371,21 @@ def from_rest(
     spectrum: ComplexArray = factors * np.fft.rfft(continued).T
     s = np.asarray(2j * np.pi * np.fft.rfftfreq(period, 1 / sample_rate), dtype=np.complex128)
     points = plate.with_far_ends(shapes)
-    by_forced, by_free = (points @ plate.displacement).T, (points @ plate.free_acceleration).T
+    forced_shapes = (points @ plate.displacement).T
+    free_shapes = (points @ plate.free_acceleration).T
     forced = np.empty((len(s), len(points)), dtype=complex)
     start = np.zeros(len(plate.eigenvalues), dtype=complex)
     for first in range(0, len(s), _BATCH):
-        some = slice(first, first + _BATCH)
-        z = plate.following_all(s[some], spectrum[some])
-        forced[some] = s[some, None] ** 2 * (z @ by_forced)
-        start += 2 * z.sum(axis=0) - (z[0] if first == 0 else 0)
+        batch = slice(first, first + _BATCH)
+        z = plate.following_all(s[batch], spectrum[batch])
+        forced[batch] = s[batch, None] ** 2 * (z @ forced_shapes)
+        counted_twice = z[0] if first == 0 else 0  # 0 Hz has no conjugate
+        start += 2 * z.sum(axis=0) - counted_twice
     free = -plate.to_free @ (plate.vectors @ start).real / period
-    ringing = [
-        ((free * np.exp(np.outer(times, plate.decay))) @ by_free).real
-        for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _BATCH)
-    ]
+    ringing = list[FloatArray]()
+    for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _BATCH):
+        decays = np.exp(np.outer(times, plate.decay))
+        ringing.append(((free * decays) @ free_shapes).real)
     return np.asarray(np.fft.irfft(forced, period, axis=0)[:count] + np.concatenate(ringing))
 
 
@@ -405,31 +429,45 @@ def enveloped_accelerations(
     bases (eras,): motions [m] at a frequency [Hz], which the envelope multiplies; points (p, r):
     shapes; fingers: shape (r,) under each and its load.
     """
-    asked, envelope = len(envelope), np.pad(envelope, (0, _GUARD))
-    count = len(envelope)
+    padded = np.pad(envelope, (0, _GUARD))
+    count = len(padded)
+    period = count * step
     growth = np.exp(_DAMPING / count * np.arange(count))
-    transform, nu = np.fft.fft(envelope / growth), np.fft.fftfreq(count, step)
+    spectrum = np.fft.fft(padded / growth)
+    nu = np.fft.fftfreq(count, step)
     lines = np.sort(nu)
-    if 1 / (count * step) < _RESOLUTION:
+    if 1 / period < _RESOLUTION:
         lines = np.arange(-_LONG_BAND, _LONG_BAND + _RESOLUTION, _RESOLUTION)
     s = np.asarray(2j * math.pi * (frequency + np.append(lines, 0.0)), dtype=complex)
-    s[:-1] += _DAMPING / (count * step)
-    found = _held_by(plate, s, bases, frequency, points, fingers)
-    steady = found[-1]
-    ends = np.sin(np.pi * np.minimum(1 - np.abs(lines / lines[0]), 0.5)) ** 2
-    transient = ((found[:-1] - steady) * ends[:, None]).astype(np.complex64)
-    is_near = np.abs(nu) <= lines[-1]
-    after = np.clip(np.searchsorted(lines, nu[is_near]), 1, len(lines) - 1)
-    share = ((lines[after] - nu[is_near]) / (lines[after] - lines[after - 1])).astype(np.float32)
-    between = share[:, None] * transient[after - 1] + (1 - share[:, None]) * transient[after]
-    every = np.zeros((count, len(steady)), dtype=np.complex64)
-    every[is_near] = transform[is_near, None].astype(np.complex64) * between
-    found = fft.ifft(every, axis=0) * growth[:, None].astype(np.float32)
-    found += envelope[:, None].astype(np.float32) * steady.astype(np.complex64)
-    return np.append(found[:asked], steady[None], axis=0)
+    s[:-1] += _DAMPING / period
+    response = _response_under_fingers(plate, s, bases, frequency, points, fingers)
+    steady = response[-1]
+    tapered = np.minimum(1 - np.abs(lines / lines[0]), 0.5)
+    taper = np.sin(np.pi * tapered) ** 2
+    transient = ((response[:-1] - steady) * taper[:, None]).astype(np.complex64)
+    is_in_band = np.abs(nu) <= lines[-1]
+    transient_spectrum = np.zeros((count, len(steady)), dtype=np.complex64)
+    transient_spectrum[is_in_band] = spectrum[is_in_band, None].astype(np.complex64) * (
+        _between_lines(lines, transient, nu[is_in_band])
+    )
+    accelerations = fft.ifft(transient_spectrum, axis=0) * growth[:, None].astype(np.float32)
+    accelerations += padded[:, None].astype(np.float32) * steady.astype(np.complex64)
+    return np.append(accelerations[: len(envelope)], steady[None], axis=0)
 
 
-def _held_by(
+def _between_lines(
+    lines: FloatArray, values: Complex64Array, frequencies: FloatArray
+) -> Complex64Array:
+    """Interpolate values (l, p) at ascending lines (l,) linearly at frequencies (n,), (n, p)."""
+    upper = np.clip(np.searchsorted(lines, frequencies), 1, len(lines) - 1)
+    lower = upper - 1
+    share = (lines[upper] - frequencies) / (lines[upper] - lines[lower])
+    lower_share = share.astype(np.float32)[:, None]
+    between: Complex64Array = lower_share * values[lower] + (1 - lower_share) * values[upper]
+    return between
+
+
+def _response_under_fingers(
     plate: PlateInTime,
     s: ComplexArray,
     bases: ComplexArray,
@@ -437,23 +475,31 @@ def _held_by(
     points: FloatArray,
     fingers: Sequence[tuple[FloatArray, Fingertip]],
 ) -> ComplexArray:
-    """Return accelerations (m, p) at complex frequencies s (m,) by bases (eras,), under fingers."""
-    single, p, k = np.complex64, len(points), len(fingers)
+    """Return accelerations (m, p) at complex frequencies s (m,) by bases (eras,), under k fingers.
+
+    Displacements are computed together for all sources (the bases' drives, their rates and a unit
+    force at each finger) at the points and at the fingers.
+    """
+    point_count = len(points)
+    finger_count = len(fingers)
     gains = np.array([era.gain(np.array(frequency)) for era in plate.eras], dtype=complex)
-    driven = np.array([gains * bases * each for each in (plate.by_drive, plate.by_rate)])
-    shapes = plate.with_far_ends(np.vstack([points, *(shape for shape, _ in fingers)]))
-    at = (shapes @ plate.displacement).astype(single)  # (p + k, 2 r)
-    forced = (shapes[p:] @ plate.forced.T).astype(single)  # (k, 2 r)
-    modal = (1 / (s[:, None] - plate.eigenvalues)).astype(single)
-    sources = np.concatenate([(driven @ plate.participation.T).astype(single), forced])
-    moved = modal @ (sources[:, None] * at).reshape(-1, at.shape[1]).T
-    moved = moved.reshape(len(s), 2 + k, p + k).astype(complex)
-    by_drive = moved[:, 0] + s[:, None] * moved[:, 1]
-    found = by_drive[:, :p]
-    if fingers:
+    driven = np.array([gains * bases * plate.by_drive, gains * bases * plate.by_rate])
+    finger_shapes = [shape for shape, _ in fingers]
+    shapes = plate.with_far_ends(np.vstack([points, *finger_shapes]))
+    modal_shapes = (shapes @ plate.displacement).astype(np.complex64)  # (p + k, 2 r)
+    by_bases = (driven @ plate.participation.T).astype(np.complex64)  # (2, 2 r)
+    by_fingers = (shapes[point_count:] @ plate.forced.T).astype(np.complex64)  # (k, 2 r)
+    sources = np.concatenate([by_bases, by_fingers])
+    residues = (sources[:, None] * modal_shapes).reshape(-1, modal_shapes.shape[1])
+    poles = (1 / (s[:, None] - plate.eigenvalues)).astype(np.complex64)
+    by_source = (poles @ residues.T).reshape(len(s), len(sources), len(shapes)).astype(complex)
+    by_drive = by_source[:, 0] + s[:, None] * by_source[:, 1]
+    displacements = by_drive[:, :point_count]
+    if finger_count:
         stiffness = np.column_stack([tip.dynamic_stiffness(-1j * s) for _, tip in fingers])
-        receptance = moved[:, 2:, p:].swapaxes(1, 2)
-        applied = (stiffness * by_drive[:, p:])[:, :, None]
+        receptance = by_source[:, 2:, point_count:].swapaxes(1, 2)
+        applied = (stiffness * by_drive[:, point_count:])[:, :, None]
         forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]  # (m, k)
-        found = found - (forces[:, None] @ moved[:, 2:, :p])[:, 0]
-    return found * (s**2)[:, None]
+        prevented = (forces[:, None] @ by_source[:, 2:, :point_count])[:, 0]
+        displacements = displacements - prevented
+    return np.asarray(displacements * (s**2)[:, None])

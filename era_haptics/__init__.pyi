@@ -40,7 +40,7 @@ from model.answer.stimulus import Finger as Finger
 from model.answer.stimulus import Stimulus as Stimulus
 from model.config.document import ConfigError as ConfigError
 from model.errors import InputError as InputError
-from model.estimate.calibrate import Calibration as Calibration
+from model.estimate.calibration_result import Calibration as Calibration
 from model.finger import Grid as Grid
 from model.reduction.reduced_plate import SupportedModes as SupportedModes
 from model.rig.rig import Rig as Rig

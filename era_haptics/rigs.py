@@ -12,8 +12,8 @@ from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing import AmplifierLayer
 from era_haptics.drive import Played, expect_rig, playable_layers
 from model.errors import InputError, expect_path, shown
-from model.estimate.calibrate import Calibration
 from model.estimate.calibrate import calibrate as fit
+from model.estimate.calibration_result import Calibration
 from model.estimate.measurement import measurement_of, read_measured
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection

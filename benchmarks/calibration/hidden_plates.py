@@ -22,9 +22,10 @@ import numpy as np
 from benchmarks.setting import RIG
 from kit.direct_plate import direct_acceleration
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.fit import gains_of as best_gains
-from model.estimate.fit import row_rms, sensed_plate
+from model.estimate.gains import gains_of as best_gains
+from model.estimate.gains import row_rms
 from model.estimate.measurement import Measurement, sensors_at, write_responses_csv
+from model.estimate.sensed_plate import sensed_plate
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -172,7 +173,7 @@ def measure(
 
 
 def true_values(rig: Rig) -> list[float]:
-    """The fitted values in the order of `model.estimate.fit.SensedPlate.rows`."""
+    """The fitted values in the order of `SensedPlate.parameters`."""
     values = [rig.plate.material.E, rig.plate.loss_factor]
     return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.in_time.mass)]
 

@@ -135,7 +135,7 @@ def calibrate(
     Writes the fitted values to a separate file and prints them with their standard errors.
     """
     from model.estimate.calibrate import calibrate as fit
-    from model.estimate.calibrate import calibration_errors
+    from model.estimate.calibration_result import calibration_errors
     from model.estimate.fit_report import (
         calibration_json,
         change_rows,

@@ -1,60 +1,42 @@
 """Findings of a rig check: their kinds and texts, and the functions that detect them.
 
 A kind is an entry of `FINDING_KINDS`, which is also the source of a table in
-`docs/how-to/measure-your-plate.md`, and a function in this module. Reversed entries of a file
-(positions, grain, resonances) describe another plate, which no fit of values can replace. They
-are detected from response shapes and corrected first: on boards as bought, a fit with the right
-entry leaves a quarter of the response unexplained, with the reversed one half to nine tenths. All
-other findings follow from a `Verdict` whose plate and channels are matched.
+`docs/how-to/measure-your-plate.md`. Reversed entries of a file (positions, grain, resonances) are
+detected before a fit by `model.estimate.misread_files`. All other findings follow from a `Verdict`
+whose plate and channels are matched.
 
 To add a kind of fault, add an entry to `FINDING_KINDS` and a function that yields findings from a
 verdict, and call it in `with_findings`.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from scipy import linalg
-from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtrc
 
-from model.arrays import ComplexArray, FloatArray, best_by, best_of, rms
-from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
-from model.estimate.identify import solved_for
-from model.estimate.measurement import Measurement
+from model.arrays import FloatArray, best_by, best_of, rms
 from model.estimate.plate_match import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
     Hypothesis,
     Load,
     Match,
-    ShapeMatch,
-    linearised,
-    match_shapes,
+    linearized,
     match_with_form,
 )
 from model.quantities import counted, in_display_unit, percent
-from model.rig.rig import Rig
-from model.rig.rig_summary import exciters_of, sections_of
-from model.rig.rig_writing import change_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 
 MAX_FORM_ERROR = 0.05
 """Largest unexplained share of the responses of a plate that form errors explain."""
 
-_OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of an exchanged sensor, at most and at least
-_MAX_COARSE_ERROR = 0.45  # of a coarse fit of the right board that has a fault
-_CLEARLY_LESS = 0.6  # of the error as written
-_OTHER_MEANING = {"free": "mounted", "mounted": "free"}
-_MAX_VARIATION = 0.8  # standard deviation of logarithms of gains; no drive has more
-_CLEARLY_STEADIER = 0.5  # of the variation as written
-
-_ORDER = ("file", "channel", "sensor", "plate", "load", "form")  # in which to look at findings
+_ORDER = ("file", "channel", "sensor", "plate", "load", "form")  # of the findings of a verdict
 _NEARLY_ALL = 0.75  # of the channels
 _MIN_SHARE = 0.05  # likelihood of a reported hypothesis
+_DETACHED = 0.1  # of the stiffness of an ERA
 _HEAVY = 0.02  # of the plate's mass, all masses together: twice the tolerance of foreign mass
 _MIN_SHOWN = 1e-6  # of a variance
 _THICKNESS = "thickness"
@@ -67,6 +49,7 @@ _FORM = {
     "side": "length and width",
     "poisson": "Poisson's ratio",
 }
+"""Names of form errors by kind of parameter."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +105,7 @@ FINDING_KINDS = {
         "file",
     ),
     "swapped": FindingKind(
-        "SWAPPED: {one} drives ERA {second}, and {other} drives ERA {first} (confidence "
+        "SWAPPED: {channel_1} drives ERA {era_2}, and {channel_2} drives ERA {era_1} (confidence "
         "{confidence:.3f}): exchange the two plugs, or the channels in the rig",
         "two channels drive each other's ERA (criterion: `other ERA`)",
     ),
@@ -243,7 +226,7 @@ FINDING_KINDS = {
         "form",
     ),
     "unnamed": FindingKind(
-        "UNNAMED: values match the rig, but something else differs: {said}; "
+        "UNNAMED: values match the rig, but something else differs: {difference}; "
         "check the plate's thickness, parts bonded to it and the sensors' scales, and measure for "
         "`era calibrate`",
         "form errors (which no rig key describes) are larger than on 99 % of plates, for example "
@@ -262,7 +245,7 @@ FINDING_KINDS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a check found."""
+    """A fault or remark that a check reports."""
 
     kind: str
     """Key of `FINDING_KINDS`."""
@@ -288,164 +271,18 @@ class Finding:
     @property
     def rows(self) -> list[str]:
         """Return printed lines: problem and remedy."""
-        own = {"of": self.of, "value": self.value, "confidence": self.confidence}
-        return FINDING_KINDS[self.kind].text.format(**{**self.details, **own}).splitlines()
+        values = {"of": self.of, "value": self.value, "confidence": self.confidence}
+        return FINDING_KINDS[self.kind].text.format(**{**self.details, **values}).splitlines()
+
+    @property
+    def rule(self) -> str:
+        """Return the first printed line without its heading."""
+        return self.rows[0].partition(": ")[2]
 
     @property
     def is_fault(self) -> bool:
         """Whether it fails the check."""
         return FINDING_KINDS[self.kind].is_fault
-
-
-Correction: TypeAlias = tuple[Finding, Rig, Measurement]
-"""Finding about a wrong rig file, with the corrected rig and measurement."""
-
-
-def reversed_axes(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement, *, may_be_plugs: bool
-) -> Correction | None:
-    """Find the axes along which a measurement is noted the wrong way round.
-
-    Channels drive the ERAs of the rig. shapes: match of the observation with the rig's plate;
-    may_be_plugs: whether exchanged channels may explain the observation as well.
-    """
-    rig, as_written = plate.rig, shapes.error()
-    if not as_written > _MAX_COARSE_ERROR:
-        return None
-    tried = []
-    for axes in (("x",), ("y",), ("x", "y"), ("frequency",)):
-        size = np.array([rig.plate.length, rig.plate.width])
-        points = np.abs(size * [axis in axes for axis in "xy"] - observation.points)
-        values = observation.values[:: -1 if axes == ("frequency",) else 1]
-        right = replace(observation.moved(points), values=values)
-        tried.append((match_shapes(plate_of(rig, right), values).error(), axes, right))
-    error, axes, right = best_by(tried, lambda each: -each[0])
-    are_plugs = shapes.error(shapes.nearest) * _CLEARLY_LESS < error
-    too_large = error >= min(_MAX_COARSE_ERROR, _CLEARLY_LESS * as_written)
-    if too_large or (are_plugs and not may_be_plugs):
-        return None
-    kind, names = "reversed" if axes == ("frequency",) else "mirrored", " and ".join(axes)
-    details = {
-        "coarse": f"with {names} from the other end a coarse fit leaves {percent(error)} of the "
-        f"responses unexplained, as written {percent(as_written)}",
-        "or_plugs": ", or plug the channels as the rig has them" if are_plugs else "",
-    }
-    return Finding(kind, names, details=details, json={"reversed_axes": [*axes]}), rig, right
-
-
-def exchanged_sensors(match: Match, observation: Measurement) -> Correction | None:
-    """Find sensors whose values match the plate at another sensor's position."""
-    values, model = match.values, match.responses[..., match.drives]
-    known, size = np.isfinite(values), row_rms(values)
-    measured = np.where(known, values, 0) / size
-    predicted = np.nan_to_num(gains_of(model, values))[:, None] * model / size
-    inner = np.abs(np.einsum("fsn,fpn->sp", measured, predicted.conj()))
-    own = (np.abs(measured) ** 2).sum(axis=(0, 2))
-    other = np.einsum("fsn,fpn->sp", known.astype(float), np.abs(predicted) ** 2)
-    coherence = inner / np.sqrt(np.maximum(own[:, None] * other, 1e-300))
-    at_own, names, points = np.diag(coherence), observation.names, observation.points.copy()
-    pairs = {}
-    for sensor, place in zip(*linear_sum_assignment(-(coherence**2)), strict=True):
-        # Both must be wrong: else two sensors are at one place, which is no exchange.
-        is_off = max(at_own[sensor], at_own[place]) < _OWN_PLACE
-        if is_off and coherence[sensor, place] > _OTHER_PLACE:
-            pairs[names[sensor]] = names[place]
-            points[sensor] = observation.points[place]
-    if not pairs:
-        return None
-    said = ", ".join(f"{name} at that of {place}" for name, place in pairs.items())
-    found = Finding("exchanged", said, json={"exchanged_sensors": pairs})
-    return found, match.plate.rig, observation.moved(points)
-
-
-def other_meaning(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement
-) -> Correction | None:
-    """Find a value that the rig of a plate has the wrong way round, the grain first.
-
-    shapes: match of the observation with that plate. None if neither is clearly wrong.
-    """
-    return turned_grain(plate, shapes, observation) or misread_resonance(plate, shapes, observation)
-
-
-def turned_grain(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement
-) -> Correction | None:
-    """Find the board with the grain along the other side, if that clearly explains more."""
-    rig = plate.rig
-    if rig.plate.material.orthotropy is None:
-        return None
-    turned = replace(rig, plate=replace(rig.plate, material=rig.plate.material.turned()))
-    turned = replace(turned, mesh=solved_for(turned, rig.limits.frequency_max).mesh)
-    tried = match_shapes(plate_of(turned, observation), observation.values)
-    error, as_written = (each.error(each.nearest) for each in (tried, shapes))
-    if error > min(_MAX_COARSE_ERROR, _CLEARLY_LESS * as_written):
-        return None
-    along = "length" if rig.grain == "width" else "width"
-    found = {
-        "expected": rig.grain,
-        "found": along,
-        "unexplained": error,
-        "unexplained_as_written": as_written,
-    }
-    details = {
-        "along": along,
-        "as_written": rig.grain,
-        "percent": percent(error),
-        "percent_as_written": percent(as_written),
-    }
-    finding = Finding("grain", "plate.grain", details=details, json={"grain": found})
-    return finding, turned, observation
-
-
-def misread_resonance(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement
-) -> Correction | None:
-    """Find exciters whose other resonance clearly explains the observation better.
-
-    Well above the resonance of the magnet on the glued coil, an exciter pushes the plate against
-    its magnet with its full force. Far below, the force is small and has the opposite sign. If a
-    file states the data sheet's `free` resonance as `mounted`, the exciters appear reversed, and
-    weak by a different factor at each frequency. On twelve boards from standard parts, gains left
-    by a coarse fit vary over frequency by 0.15 to 0.43 (standard deviation of their logarithms)
-    with the right resonance, and by 1.2 or more with the wrong one.
-    """
-    rig, values = plate.rig, observation.values
-    written = {
-        name: str(section.values["resonance_is"])
-        for name, section in sections_of(rig).items()
-        if not section.stiffness
-    }
-    as_written = _variation(plate, shapes, values) if written else 0.0
-    if not as_written > _MAX_VARIATION:
-        return None
-    for which in dict.fromkeys(written.values()):
-        meant = {name: _OTHER_MEANING[which] for name, own in written.items() if own == which}
-        other = change_rig(rig, eras={name: {"resonance_is": each} for name, each in meant.items()})
-        sensed = plate_of(other, observation)
-        found = _variation(sensed, match_shapes(sensed, values), values)
-        if found < _CLEARLY_STEADIER * as_written:
-            glued = next(e.magnet_frequency for e in exciters_of(other) if e.name in meant)
-            details = {
-                "which": _OTHER_MEANING[which],
-                "as_written": which,
-                "factor": math.exp(found),
-                "factor_as_written": math.exp(as_written),
-            }
-            names, changed = ", ".join(meant), {"resonance_is": meant}
-            finding = Finding("resonance", names, glued, details=details, json=changed)
-            return finding, other, observation
-    return None
-
-
-def _variation(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> float:
-    """Standard deviation over frequency of the logarithm of gains, the median channel's."""
-    model = plate.model.at(plate.moved(*shapes.start)).responses[..., shapes.nearest]
-    gains = np.abs(gains_of(model, values))
-    driven = np.isfinite(gains).sum(axis=0) > 1
-    with np.errstate(divide="ignore"):
-        sizes = np.log(gains[:, driven])
-    return float(np.median(np.nanstd(sizes, axis=0))) if driven.any() else 0.0
 
 
 @dataclass(frozen=True)
@@ -504,12 +341,12 @@ class Verdict:
     compared."""
 
     def of_kinds(self, *kinds: str) -> list[Finding]:
-        """The findings of some kinds."""
-        return [each for each in self.findings if each.kind in kinds]
+        """Return the findings of some kinds."""
+        return [finding for finding in self.findings if finding.kind in kinds]
 
-    def about(self, *what: str) -> list[Finding]:
-        """The findings about some of what `FindingKind.about` names."""
-        return [each for each in self.findings if each.about in what]
+    def about(self, *subjects: str) -> list[Finding]:
+        """Return the findings about some subjects; see `FindingKind.about`."""
+        return [finding for finding in self.findings if finding.about in subjects]
 
     @property
     def wiring_matches(self) -> bool:
@@ -519,164 +356,239 @@ class Verdict:
     @property
     def is_well(self) -> bool:
         """Whether no fault was found."""
-        return not any(each.is_fault for each in self.findings)
+        return not any(finding.is_fault for finding in self.findings)
 
     @property
     def kept_share(self) -> float | None:
         """Fraction of the table's promises that the plate keeps, None if not compared."""
-        return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
+        if not self.promise_margins:
+            return None
+        return float(np.mean(np.array(self.promise_margins) >= 0))
 
 
 def with_findings(verdict: Verdict) -> Verdict:
     """Return the verdict with the findings that follow from it added."""
-    mounts = [  # an ERA that hardly holds the plate
-        Finding("detached", each.era, each.value / each.expected)
-        for each in verdict.hypotheses[:1]
-        if each.era and each.explains and each.value < 0.1 * each.expected
+    findings = [
+        *_swapped_channels(verdict),
+        *_channel_faults(verdict),
+        *_plate_differences(verdict),
+        *_detached_eras(verdict),
+        *verdict.findings,
     ]
-    found = [*_of_channels(verdict), *_of_plate(verdict), *mounts, *verdict.findings]
-    ordered = sorted(found, key=lambda each: _ORDER.index(each.about))
-    return replace(verdict, findings=tuple(ordered))
+    findings.sort(key=lambda finding: _ORDER.index(finding.about))
+    return replace(verdict, findings=tuple(findings))
 
 
 def cycles(channels: Sequence[ChannelVerdict]) -> list[list[ChannelVerdict]]:
-    """Cycles of channels that drive each other's ERAs, each from its first channel."""
-    by_era = {each.era: each for each in channels}
-    found: list[list[ChannelVerdict]] = []
-    for channel in channels:
-        cycle = [channel]
-        while (after := cycle[-1].drives) is not None and by_era[after] not in cycle:
-            cycle.append(by_era[after])
-        is_known = any(channel in each for each in found)
-        if after == channel.era and len(cycle) > 1 and not is_known:
-            found.append(cycle)
-    return found
+    """Return cycles of channels that drive each other's ERAs, each from its first channel."""
+    by_era = {channel.era: channel for channel in channels}
+    complete: list[list[ChannelVerdict]] = []
+    for first in channels:
+        cycle = [first]
+        driven = first.drives
+        while driven is not None and by_era[driven] not in cycle:
+            cycle.append(by_era[driven])
+            driven = cycle[-1].drives
+        is_repeated = any(first in earlier for earlier in complete)
+        if driven == first.era and len(cycle) > 1 and not is_repeated:
+            complete.append(cycle)
+    return complete
 
 
-def _of_channels(verdict: Verdict) -> Iterator[Finding]:
-    """Yield problems of channels, common ones first."""
-    channels, swapped = verdict.channels, cycles(verdict.channels)
-    for cycle in swapped:
-        names, confidence = [each.era for each in cycle], min(each.confidence for each in cycle)
-        details = {"one": cycle[0].wiring, "other": cycle[1].wiring}
-        details |= {"first": names[0], "second": names[1]}
-        kind = "swapped" if len(cycle) == 2 else "cycle"
-        yield Finding(kind, ", ".join(names), confidence=confidence, details=details)
-    driven = [each for each in channels if each.drives is not None]
-    known = {"well", "not driven"}
+def _swapped_channels(verdict: Verdict) -> Iterator[Finding]:
+    """Yield cycles of channels that drive each other's ERAs."""
+    for cycle in cycles(verdict.channels):
+        eras = [channel.era for channel in cycle]
+        details = {
+            "channel_1": cycle[0].wiring,
+            "channel_2": cycle[1].wiring,
+            "era_1": eras[0],
+            "era_2": eras[1],
+        }
+        yield Finding(
+            kind="swapped" if len(cycle) == 2 else "cycle",
+            of=", ".join(eras),
+            confidence=min(channel.confidence for channel in cycle),
+            details=details,
+        )
+
+
+def _channel_faults(verdict: Verdict) -> Iterator[Finding]:
+    """Yield problems of channels, common ones first, without swapped channels."""
+    common = {"well", "not driven"}
+    for finding, state in _common_faults(verdict.channels):
+        yield finding
+        common.add(state)
+    swapped = []
+    for cycle in cycles(verdict.channels):
+        swapped += cycle
+    for channel in verdict.channels:
+        details = {**vars(channel), "wiring": channel.wiring}
+        for state in channel.states:
+            is_swapped = state == "other ERA" and channel in swapped
+            if state not in common and not is_swapped:
+                yield Finding(
+                    kind=state,
+                    of=channel.era,
+                    value=channel.gain or 0.0,
+                    confidence=channel.confidence,
+                    details=details,
+                )
+
+
+def _common_faults(channels: Sequence[ChannelVerdict]) -> Iterator[tuple[Finding, str]]:
+    """Yield problems that nearly all driven channels have, with their states."""
+    driven = [channel for channel in channels if channel.drives is not None]
     for state in ("strong", "weak"):
-        gains = {each.era: each.gain for each in driven if state in each.states and each.gain}
+        gains = {}
+        for channel in driven:
+            if state in channel.states and channel.gain:
+                gains[channel.era] = channel.gain
         if len(gains) > 1 and len(gains) >= _NEARLY_ALL * len(driven):
-            sizes, said = [*gains.values()], {"state": state.upper(), "least": min(gains.values())}
-            yield Finding("all strong or weak", ", ".join(gains), max(sizes), details=said)
-            known.add(state)
+            details = {"state": state.upper(), "least": min(gains.values())}
+            highest = max(gains.values())
+            yield Finding("all strong or weak", ", ".join(gains), highest, details=details), state
             break
-    inverted = ["inverted" in each.states for each in driven]
-    if len(inverted) > 1 and all(inverted):
-        yield Finding("all inverted", "all")
-        known.add("inverted")
-    in_cycle = [each for cycle in swapped for each in cycle]
-    for each in channels:
-        values = {**vars(each), "wiring": each.wiring}
-        for state in each.states:
-            if state not in known and (state != "other ERA" or each not in in_cycle):
-                yield Finding(state, each.era, each.gain or 0.0, each.confidence, details=values)
+    inverted = [channel for channel in driven if "inverted" in channel.states]
+    if len(inverted) > 1 and len(inverted) == len(driven):
+        yield Finding("all inverted", "all"), "inverted"
 
 
-def _of_plate(verdict: Verdict) -> Iterator[Finding]:
+def _plate_differences(verdict: Verdict) -> Iterator[Finding]:
     """Yield differences of the plate from the rig, and the hypotheses that would explain them.
 
     A loose exciter is named instead. Without differences, outliers are counted.
     """
-    match, hypotheses = verdict.match, verdict.hypotheses
-    is_loose = any("loose" in each.states for each in verdict.channels)
+    match = verdict.match
     if match is None:
         return
+    is_loose = any("loose" in channel.states for channel in verdict.channels)
     if verdict.plate_matches or is_loose:
-        by_sensor = match.outliers.sum(axis=(0, 2))
-        if count := int(by_sensor.sum()):
-            details = {"count": counted(count, "value")}
-            worst = verdict.sensors[best_of(by_sensor)]
-            yield Finding("outliers", worst, int(by_sensor.max()), details=details)
+        yield from _outliers(match, verdict.sensors)
         return
-    why = f"{percent(match.error)} unexplained at best"
+    reason = f"{percent(match.error)} unexplained at best"
     if match.error <= MAX_FIT_ERROR:
-        at = best_of(abs(match.z))
-        name = match.plate.rows[at].name
-        why = f"{name} would be off by {abs(match.z[at]):.1f} standard deviations"
-    good = [each for each in hypotheses if each.explains and each.share >= _MIN_SHARE]
-    width = max((len(each.key) for each in good), default=0)
-    rows = [
-        f"  {each.key:{width}}  {in_display_unit(each.expected, each.unit)} -> "
-        f"{in_display_unit(each.value, each.unit)} would explain it: "
-        f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}"
-        for each in good
-    ]
-    if good:
-        rows.append(f"  correct {good[0].key} in the rig, or the plate; then check again")
-    else:
-        rows.append(
+        farthest = best_of(abs(match.z))
+        name = match.plate.parameters[farthest].name
+        reason = f"{name} would be off by {abs(match.z[farthest]):.1f} standard deviations"
+    good = []
+    for hypothesis in verdict.hypotheses:
+        if hypothesis.explains and hypothesis.share >= _MIN_SHARE:
+            good.append(hypothesis)
+    details = {"why": reason, "hypotheses": "\n".join(_hypothesis_rows(good))}
+    key = good[0].key if good else ""
+    yield Finding("plate", key, match.worst, details=details)
+
+
+def _outliers(match: Match, sensors: Sequence[str]) -> Iterator[Finding]:
+    """Yield the number of outliers, if there are any."""
+    by_sensor = match.outliers.sum(axis=(0, 2))
+    count = int(by_sensor.sum())
+    if count:
+        worst = best_of(by_sensor)
+        details = {"count": counted(count, "value")}
+        yield Finding("outliers", sensors[worst], int(by_sensor[worst]), details=details)
+
+
+def _hypothesis_rows(hypotheses: Sequence[Hypothesis]) -> list[str]:
+    """Return lines of hypotheses that explain a plate, most likely first, and the remedy."""
+    if not hypotheses:
+        return [
             "  no single parameter of the rig would explain it: check plate, positions of sensors "
             "and ERAs, and measure for `era calibrate`"
+        ]
+    width = max(len(hypothesis.key) for hypothesis in hypotheses)
+    rows = []
+    for hypothesis in hypotheses:
+        expected = in_display_unit(hypothesis.expected, hypothesis.unit)
+        value = in_display_unit(hypothesis.value, hypothesis.unit)
+        rows.append(
+            f"  {hypothesis.key:{width}}  {expected} -> {value} would explain it: "
+            f"{percent(hypothesis.match.error)} unexplained, likelihood {percent(hypothesis.share)}"
         )
-    details = {"why": why, "hypotheses": "\n".join(rows)}
-    yield Finding("plate", good[0].key if good else "", match.worst, details=details)
+    rows.append(f"  correct {hypotheses[0].key} in the rig, or the plate; then check again")
+    return rows
+
+
+def _detached_eras(verdict: Verdict) -> Iterator[Finding]:
+    """Yield an ERA that hardly holds the plate, if this is the likeliest hypothesis."""
+    for hypothesis in verdict.hypotheses[:1]:
+        is_soft = hypothesis.value < _DETACHED * hypothesis.expected
+        if hypothesis.era and hypothesis.explains and is_soft:
+            yield Finding("detached", hypothesis.era, hypothesis.value / hypothesis.expected)
 
 
 def match_beyond(match: Match) -> tuple[Match, list[Finding]]:
     """Match a plate again with form errors and loads, and find those beyond tolerances."""
     best, loads = match_with_form(match)
-    rig, error = match.plate.rig, {"unexplained": best.error}
-    mass = sum(each.mass for each in loads if isinstance(each, PointLoad))
-    is_heavy = mass >= _HEAVY * rig.plate.mass
-    # A mass within tolerance is not a fault, and neither are form errors that could replace it.
-    named = [each for each in loads if is_heavy or isinstance(each, FingertipLoad)]
-    if named:
-        return best, [_load_finding(each, best.error) for each in named]
-    own = {words: best.fit.x[best.fit.space.of(kind)] for kind, words in _FORM.items()}
-    own[_THICKNESS], (x, y) = _along_plate(best)
-    chances = {
-        words: (1 if words == _THICKNESS else len(_FORM)) * float(chdtrc(len(z), z @ z))
-        for words, z in own.items()
-    }
-    farthest = best_by([*chances], lambda words: -chances[words])
-    if (chance := chances[farthest]) >= FALSE_ALARM:
-        said = {"said": f"{percent(best.error)} of the response is unexplained"}
-        unnamed = Finding("unnamed", "response", best.error, details=said, json=error)
-        return best, [unnamed] if best.error > MAX_FORM_ERROR else []
-    deviation = rms(own[farthest])
-    known = {"farthest": farthest, "standard_deviations": deviation, **error}
-    if farthest == _THICKNESS:
-        along = {"along_x": f"{100 * x:+.1f} %", "along_y": f"{100 * y:+.1f} %"}
-        known |= {"thicker_at_end_of_x": x, "thicker_at_end_of_y": y}
-        return best, [Finding(_THICKNESS, "ends", deviation, 1.0, chance, along, known)]
-    said = {"said": f"{farthest} are off by {deviation:.1f} standard deviations of their tolerance"}
-    return best, [Finding("unnamed", farthest, deviation, 1.0, chance, said, known)]
+    mass = sum(load.mass for load in loads if isinstance(load, PointLoad))
+    if mass < _HEAVY * match.plate.rig.plate.mass:
+        # A mass within tolerance is not a fault, and neither are form errors that could replace it.
+        loads = [load for load in loads if isinstance(load, FingertipLoad)]
+    if loads:
+        return best, [_load_finding(load, best.error) for load in loads]
+    finding = _form_finding(best)
+    return best, [finding] if finding else []
 
 
 def _load_finding(load: Load, error: float) -> Finding:
+    """Return the finding of a load; error: unexplained share of the responses."""
     details: dict[str, Any] = {"x_m": load.x, "y_m": load.y}
-    mass = load.mass if isinstance(load, PointLoad) else None
-    known = {"loads": [{**details, "mass_kg": mass}], "unexplained": error}
-    if mass is None:
-        return Finding("finger", "plate", details=details, json=known)
-    details["grams"] = in_display_unit(mass, "kg")
-    return Finding("mass", "plate", mass, details=details, json=known)
+    if isinstance(load, PointLoad):
+        json = {"loads": [{**details, "mass_kg": load.mass}], "unexplained": error}
+        details["grams"] = in_display_unit(load.mass, "kg")
+        return Finding("mass", "plate", load.mass, details=details, json=json)
+    json = {"loads": [{**details, "mass_kg": None}], "unexplained": error}
+    return Finding("finger", "plate", details=details, json=json)
+
+
+def _form_finding(match: Match) -> Finding | None:
+    """Return the form error that is least likely on correct plates, or the unexplained response,
+    None if both are within tolerances."""
+    chances = {}
+    sizes = {}
+    for kind, name in _FORM.items():
+        z = match.fit.x[match.fit.space.of(kind)]
+        chances[name] = len(_FORM) * float(chdtrc(len(z), z @ z))
+        sizes[name] = rms(z)
+    slope, (x, y) = _along_plate(match)
+    chances[_THICKNESS] = float(chdtrc(len(slope), slope @ slope))
+    sizes[_THICKNESS] = rms(slope)
+    farthest = best_by([*chances], lambda name: -chances[name])
+    chance = chances[farthest]
+    json: dict[str, Any] = {"unexplained": match.error}
+    if chance >= FALSE_ALARM:
+        if match.error <= MAX_FORM_ERROR:
+            return None
+        details = {"difference": f"{percent(match.error)} of the response is unexplained"}
+        return Finding("unnamed", "response", match.error, details=details, json=json)
+    size = sizes[farthest]
+    json |= {"farthest": farthest, "standard_deviations": size}
+    if farthest == _THICKNESS:
+        details = {"along_x": f"{100 * x:+.1f} %", "along_y": f"{100 * y:+.1f} %"}
+        json |= {"thicker_at_end_of_x": x, "thicker_at_end_of_y": y}
+        return Finding("thickness", "ends", size, chance=chance, details=details, json=json)
+    difference = f"{farthest} are off by {size:.1f} standard deviations of their tolerance"
+    details = {"difference": difference}
+    return Finding("unnamed", farthest, size, chance=chance, details=details, json=json)
 
 
 def _along_plate(match: Match) -> tuple[FloatArray, tuple[float, float]]:
     """Return the slope of sensor scales along both sides (2,), and the taper that explains it.
 
-    A plate moves more at a thinner end. The slope is in standard deviations, the taper relative at
-    the ends of x and of y. The fit's prior reduces scales, so the scales of good plates vary by
-    less than their tolerance.
+    A plate moves more at a thinner end. The slope is relative to its standard error, the taper is
+    relative at the ends of x and of y. The fit's prior reduces scales, so the scales of good plates
+    vary by less than their tolerance.
     """
-    space, plate, points = match.fit.space, match.plate.rig.plate, match.fit.measurement.points
-    own = space.groups["sensor_scale"]
-    along = 2 * points / [plate.length, plate.width] - 1
+    space = match.fit.space
+    part = space.groups["sensor_scale"]
+    points = match.fit.measurement.points
+    along = 2 * points / match.plate.sides - 1
     basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
-    shown = np.eye(len(points)) - linearised(match).stated_covariance[own, own]
-    shown, rises = basis.T @ shown @ basis + _MIN_SHOWN * np.eye(2), basis.T @ match.fit.x[own]
-    thinner = basis @ linalg.solve(shown, rises) * space.std[own]
-    x, y = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
-    return linalg.solve(linalg.cholesky(shown, lower=True), rises), (float(x), float(y))
+    shown = np.eye(len(points)) - linearized(match).stated_covariance[part, part]
+    shown = basis.T @ shown @ basis + _MIN_SHOWN * np.eye(2)
+    slope = basis.T @ match.fit.x[part]
+    thinner = basis @ linalg.solve(shown, slope) * space.std[part]
+    taper = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
+    root = linalg.cholesky(shown, lower=True)
+    return linalg.solve(root, slope), (float(taper[0]), float(taper[1]))

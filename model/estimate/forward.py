@@ -32,7 +32,7 @@ therefore its mode shapes (`ReducedModes` of `model.reduction`).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
@@ -158,6 +158,8 @@ class ParameterKind(ABC):
 
     name: str
     """Key of the kind in `Space` and `PlateValues`."""
+    label: str
+    """Name of a parameter in reports, without the name of its ERA, sensor or mode."""
     std: float
     """Standard deviation for a plate without a measurement, in the unit of `PlateValues`."""
     unit = "%"
@@ -213,8 +215,8 @@ class Space:
     @classmethod
     def empty(cls, kinds: Mapping[str, ParameterKind]) -> "Space":
         """A space without parameters."""
-        none = np.zeros(0)
-        return cls((), none, none, none, {}, kinds)
+        empty = np.zeros(0)
+        return cls((), empty, empty, empty, {}, kinds)
 
     @property
     def size(self) -> int:
@@ -229,7 +231,7 @@ class Space:
     @cached_property
     def uncertain(self) -> NDArray[np.bool_]:
         """Mask (p,) of the parameters with a prior uncertainty."""
-        return np.asarray(self.std > 0)
+        return self.std > 0
 
     def of(self, *kinds: str) -> NDArray[np.bool_]:
         """Return a mask (p,) of the uncertain parameters of some kinds."""
@@ -240,29 +242,26 @@ class Space:
 
     def extended(self, kind: ParameterKind, names: Sequence[str], prior: Prior) -> "Space":
         """Return the space with parameters of another kind appended."""
-        std, lower, upper = (np.broadcast_to(each, len(names)) for each in prior)
+        std = np.broadcast_to(prior.std, len(names))
         scale = np.where(std > 0, std, 1.0)
         return replace(
             self,
             names=(*self.names, *names),
             std=np.append(self.std, std),
-            lower=np.append(self.lower, lower / scale),
-            upper=np.append(self.upper, upper / scale),
+            lower=np.append(self.lower, prior.lower / scale),
+            upper=np.append(self.upper, prior.upper / scale),
             groups=self.groups | {kind.name: slice(self.size, self.size + len(names))},
         )
 
-    def of_kinds(self, get: Callable[[ParameterKind], float]) -> FloatArray:
-        """Return a property of the kind of each parameter, in its unit (p,), 0 for known ones."""
-        properties = np.zeros(self.size)
-        for kind, part in self.groups.items():
-            properties[part] = get(self.kinds[kind])
-        return np.where(self.uncertain, properties, 0.0)
-
     @cached_property
     def as_built(self) -> "Space":
-        """Space of a plate that was not measured, with the default deviations unless the rig states
-        its own."""
-        return replace(self, std=np.maximum(self.std, self.of_kinds(lambda kind: kind.std)))
+        """Space of a plate that was not measured, with the default priors unless the rig states its
+        own."""
+        default = np.zeros(self.size)
+        for kind, part in self.groups.items():
+            default[part] = self.kinds[kind].std
+        default = np.where(self.uncertain, default, 0.0)
+        return replace(self, std=np.maximum(self.std, default))
 
     def indices(self, kind: str) -> range:
         """Return the indices of the parameters of a kind."""
@@ -271,13 +270,14 @@ class Space:
     def values(self, x: FloatArray, kind: str) -> FloatArray:
         """Return the deviations of a kind's parameters from the rig, in their units, for x (p,)."""
         part = self.groups[kind]
-        return np.asarray(self.std[part] * x[part])
+        return self.std[part] * x[part]
 
     def index(self, name: str) -> int:
         """Return the index of a parameter by name; raises ValueError for an unknown one."""
         return self.names.index(name)
 
 
+@dataclass(frozen=True, eq=False)
 class PlateValues:
     """Values of a rig's plate for parameters x (p,), by kind.
 
@@ -285,8 +285,9 @@ class PlateValues:
     sensors.
     """
 
-    def __init__(self, rig: Rig, space: Space, x: FloatArray) -> None:
-        self.rig, self.space, self.x = rig, space, x
+    rig: Rig
+    space: Space
+    x: FloatArray
 
     def deviations(self, kind: str) -> FloatArray:
         """Return the deviations of all parameters of a kind from the rig, in their unit."""
@@ -349,8 +350,10 @@ class ForwardModel:
 
     def __post_init__(self) -> None:
         """Raise InputError for a plate with wrong responses and slopes."""
-        stds = (self.space.std[self.space.groups[kind]] for kind in ("thickness", "modulus"))
-        check_scales(self.rig.plate, *(1 + std for std in stds), remedy=WITHOUT_PART)
+        groups = self.space.groups
+        thickness = 1 + self.space.std[groups["thickness"]]
+        modulus = 1 + self.space.std[groups["modulus"]]
+        check_scales(self.rig.plate, thickness, modulus, remedy=WITHOUT_PART)
 
     @cached_property
     def omega(self) -> FloatArray:
@@ -366,10 +369,15 @@ class ForwardModel:
     def observed(self) -> IntArray:
         """Indices of the sensors among the attachments, (s,)."""
         names = [era.name for era in self.rig.eras]
-        after = len(names) + len(self.rig.masses) + self.mass_count
-        at_eras = [names.index(each.era) if each.era else -1 for each in self.sensors]
-        alone = np.array(at_eras) < 0
-        return np.where(alone, after + np.cumsum(alone) - 1, at_eras)
+        number = len(names) + len(self.rig.masses) + self.mass_count
+        observed = []
+        for sensor in self.sensors:
+            if sensor.era:
+                observed.append(names.index(sensor.era))
+            else:
+                observed.append(number)
+                number += 1
+        return np.array(observed, dtype=int)
 
     @property
     def modes(self) -> Modes:
@@ -399,8 +407,8 @@ class ForwardModel:
     @cached_property
     def springs(self) -> ComplexArray:
         """Dynamic stiffness of the springs of the rig's feet, with their losses (f, q) [N/m]."""
-        found = [self.rig.masses[number].spring(self.omega) for number in self.rig.feet]
-        return np.array(found, dtype=complex).reshape(-1, len(self.omega)).T
+        springs = [self.rig.masses[number].spring(self.omega) for number in self.rig.feet]
+        return np.array(springs, dtype=complex).reshape(-1, len(self.omega)).T
 
     @cached_property
     def drive_gains(self) -> ComplexArray:
@@ -410,17 +418,16 @@ class ForwardModel:
     @cached_property
     def pads(self) -> FloatArray:
         """Footprints (q, 3) of the sensors that are not at ERAs [m]."""
-        alone = [
-            (each.x, each.y, SENSOR_FOOT if each.mass else 0.0)
-            for each in self.sensors
-            if not each.era
-        ]
-        return np.array(alone, dtype=float).reshape(-1, 3)
+        pads = []
+        for sensor in self.sensors:
+            if not sensor.era:
+                pads.append((sensor.x, sensor.y, SENSOR_FOOT * bool(sensor.mass)))
+        return np.array(pads, dtype=float).reshape(-1, 3)
 
     @cached_property
     def sensor_inertia(self) -> FloatArray | None:
         """omega² times the masses of the sensors (f, s) [N/m], None if they are massless."""
-        masses = np.array([each.mass for each in self.sensors])
+        masses = np.array([sensor.mass for sensor in self.sensors])
         return self.omega[:, None] ** 2 * masses if masses.any() else None
 
     @cached_property
@@ -428,11 +435,11 @@ class ForwardModel:
         """Indices of the attachments that can move: ERAs, additional masses, sensors off ERAs."""
         if not self.space.of("place", "masses", "sensor_place").any():
             return np.array([], dtype=int)
-        first = len(self.rig.eras) + len(self.rig.masses)
-        movable = [*range(len(self.rig.eras)), *range(first, first + self.mass_count)]
-        last = first + self.mass_count
-        sensors = range(last, last + len(self.space.indices("sensor_place")) // 2)
-        return np.array([*movable, *sensors], dtype=int)
+        eras = len(self.rig.eras)
+        first_mass = eras + len(self.rig.masses)
+        # Sensors follow the additional masses.
+        count = self.mass_count + len(self.space.indices("sensor_place")) // 2
+        return np.array([*range(eras), *range(first_mass, first_mass + count)], dtype=int)
 
     def at(self, x: FloatArray) -> "PlateAt":
         """Return the plate for parameters x (p,)."""
@@ -488,45 +495,47 @@ class PlateAt:
     def __init__(
         self, model: ForwardModel, x: FloatArray, further: ComplexArray | None = None
     ) -> None:
-        self.model, self.values = model, PlateValues(model.rig, model.space, x)
+        self.model = model
+        self.values = PlateValues(model.rig, model.space, x)
         self.further = further
         self.functions = self._functions()
         """The free plate's modal receptance and truncated sums as functions of frequency."""
         self.located = model.places(self.values)
         """Shapes at all attachments."""
-        w, values = model.omega[:, None], self.values
-        self.sources = values.sources()
+        self.sources = self.values.sources()
         """ERAs with their values."""
-        self.source_slopes = [each.slopes(model.omega) for each in self.sources]
+        self.source_slopes = [source.slopes(model.omega) for source in self.sources]
         """Derivatives of each ERA's dynamic stiffness and force with respect to its values."""
-        self.full_levels = np.array([each.full_level for each in self.sources])
+        self.full_levels = np.array([source.full_level for source in self.sources])
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
         """Force of each ERA on a clamped plate, per unit of its drive, (f, n)."""
-        fixed = model.fixed_stiffness.copy()
-        fixed[:, list(model.rig.feet)] += (values["supports"] - 1) * model.springs
-        held = [
-            attached_stiffness(model.omega, self.sources),
-            fixed,
-            -(w**2) * values["masses"][:, 0],
-            np.zeros((len(w), len(model.pads))),
-        ]
-        self.stiffness = Z = np.concatenate(held, axis=1)
-        """Dynamic stiffness of the attachments (f, a) [N/m]."""
-        shapes, moved = self.located.shapes, self.solved(self.located.shapes)
-        A = shapes @ moved + combined(self.functions.truncated(TERMS), self.located.truncated)
+        self.stiffness = self._attached_stiffness()
+        """Dynamic stiffness Z of the attachments (f, a) [N/m]."""
+        self.moved = self.solved(self.located.shapes)
+        """Coordinates of the free plate for a force at each attachment (f, r, a) [s²/kg]."""
+        truncated = combined(self.functions.truncated(TERMS), self.located.truncated)
+        self.free_receptance = A = self.located.shapes @ self.moved + truncated
+        """A, receptance of the free plate (f, a, a) [m/N]."""
         # The sensors, last in order, have no stiffness.
-        count = Z.shape[1] - len(model.pads)
-        forces = coupled_forces(A[:, :count, :count], Z[:, :count], np.eye(count, dtype=complex))
-        reaction = A[:, :, :count] @ forces * Z[:, None, :count]
-        self.left = np.repeat(np.eye(Z.shape[1], dtype=complex)[None], len(w), axis=0)
+        count = A.shape[1] - len(model.pads)
+        Z = self.stiffness[:, :count]
+        forces = coupled_forces(A[:, :count, :count], Z, np.eye(count, dtype=complex))
+        reaction = A[:, :, :count] @ forces * Z[:, None]
+        self.left = np.repeat(np.eye(A.shape[1], dtype=complex)[None], len(A), axis=0)
         self.left[:, :, :count] -= reaction
         """L = 1 - T Z (f, a, a)."""
         self.receptance = A - reaction @ A[:, :count]
         """T, receptance of the plate with its attachments (f, a, a) [m/N]."""
-        self.free_receptance = A
-        """A, receptance of the free plate (f, a, a) [m/N]."""
-        self.moved = moved
-        """Coordinates of the free plate for a force at each attachment (f, r, a) [s²/kg]."""
+
+    def _attached_stiffness(self) -> ComplexArray:
+        """Dynamic stiffness of ERAs, masses, additional masses and sensors (f, a) [N/m]."""
+        model = self.model
+        fixed = model.fixed_stiffness.copy()
+        fixed[:, list(model.rig.feet)] += (self.values["supports"] - 1) * model.springs
+        masses = -(model.omega[:, None] ** 2) * self.values["masses"][:, 0]
+        sensors = np.zeros((len(model.omega), len(model.pads)))
+        sources = attached_stiffness(model.omega, self.sources)
+        return np.concatenate([sources, fixed, masses, sensors], axis=1)
 
     @cached_property
     def reach(self) -> ComplexArray:
@@ -537,12 +546,14 @@ class PlateAt:
         """Return coordinates of the free plate for forces with shapes (a, r), (f, r, a) [s²/kg]."""
         functions = self.functions
         if self.bending is None:
-            return np.asarray(functions.modal[:, :, None] * shapes.T)
-        h, omega2 = functions.thickness, (self.model.omega**2)[:, None]
+            return functions.modal[:, :, None] * shapes.T
+        h = functions.thickness
+        omega2 = (self.model.omega**2)[:, None]
         system = h**2 * self.bending - omega2[:, None] * self.added
         diagonal = np.arange(len(shapes.T))
         system[:, diagonal, diagonal] += h**2 * functions.elastic - omega2
-        system += 0.0 if self.further is None else self.further
+        if self.further is not None:
+            system += self.further
         return np.asarray(np.linalg.solve(system, shapes.T.astype(complex)) / h)
 
     @cached_property
@@ -553,8 +564,8 @@ class PlateAt:
     @cached_property
     def drive(self) -> ComplexArray:
         """Force of each drive on the plate per unit of its input, times -omega² (f, n)."""
-        values, model = self.values, self.model
-        force = self.force * values["gain"] * model.drive_gains * self.lag
+        model = self.model
+        force = self.force * self.values["gain"] * model.drive_gains * self.lag
         return np.asarray(-(model.omega**2)[:, None] * force)
 
     @cached_property
@@ -567,8 +578,10 @@ class PlateAt:
     def loaded(self) -> ComplexArray:
         """Receptance between sensors and ERAs, with each sensor's mass on the plate (f, s, n)
         [m/N]."""
-        found = self.receptance[:, self.model.observed, : self.force.shape[1]]
-        return np.asarray(found if self.lightness is None else self.lightness[:, :, None] * found)
+        loaded = self.receptance[:, self.model.observed, : self.force.shape[1]]
+        if self.lightness is not None:
+            loaded = self.lightness[:, :, None] * loaded
+        return np.asarray(loaded)
 
     @cached_property
     def seen(self) -> ComplexArray:
@@ -581,10 +594,11 @@ class PlateAt:
     def lightness(self) -> ComplexArray | None:
         """Motion of the plate at each sensor relative to that without its mass, None if
         always 1."""
-        inertia, at = self.model.sensor_inertia, self.model.observed
+        inertia = self.model.sensor_inertia
         if inertia is None:
             return None
-        return np.asarray(1 / (1 - inertia * self.receptance[:, at, at]))
+        observed = self.model.observed
+        return np.asarray(1 / (1 - inertia * self.receptance[:, observed, observed]))
 
     @cached_property
     def responses(self) -> ComplexArray:
@@ -592,52 +606,58 @@ class PlateAt:
 
         [1/s²] for a moving base, [m/s²/V] for an exciter.
         """
-        return np.asarray(self.scale * self.seen)
+        return self.scale * self.seen
 
     def _functions(self) -> FreeReceptance:
-        model, values = self.model, self.values
-        modes, theory = model.shifted_modes, model.elasticity
-        eta = (
-            max(values["loss"], MIN_LOSS_FACTOR)
-            * (model.frequencies / LOSS_FREQUENCY) ** values["loss_exponent"]
-        )
-        eigenvalues, relative = theory.eigenvalues.copy(), theory.relative_loss.copy()
-        eigenvalues[modes] *= np.exp(values["mode_shifts"])
-        relative[modes] *= np.exp(values["mode_losses"])
-        loss: FloatArray = np.multiply.outer(eta, relative)
-        rig, solved = model.rig.plate, model.free.plate
-        thickness = values["thickness"] * rig.thickness / solved.thickness
-        modulus = values["modulus"] * rig.material.E / solved.material.E
-        # Soft layers and air lose energy in addition to the plate's loss factor, and vary with
-        # their mode.
-        further = theory.losses.copy()
-        further[modes] *= np.exp(values["mode_shifts"] + values["mode_losses"])
-        own = loss * eigenvalues
-        lossy = eigenvalues + 1j * (own + further)
-        if theory.dispersion is not None:
-            lossy = lossy + theory.dispersion.at(model.omega)
-        self.by_loss, self.by_mode_loss = (
-            np.divide(1j * each, lossy, out=np.zeros(lossy.shape, dtype=complex), where=lossy != 0)
-            for each in (own, own + further)
-        )
-        """Derivatives of the logarithm of each mode's stiffness by the plate's loss factor, and by
-        the total loss of the mode (f, r)."""
-        self.by_loss_of_rest = np.asarray(1j * eta / (1 + 1j * eta))
-        """The same for the rest of the plate, by the loss factor (f,)."""
-        self.eta = eta
-        """Loss factor (f,)."""
-        self.modulus = modulus
+        """Return the free plate's receptance for these values; set the stiffness that varies."""
+        model = self.model
+        values = self.values
+        plate = model.rig.plate
+        solved = model.free.plate
+        thickness = values["thickness"] * plate.thickness / solved.thickness
+        self.modulus = values["modulus"] * plate.material.E / solved.material.E
         """Modulus relative to the solved plate's."""
+        power = (model.frequencies / LOSS_FREQUENCY) ** values["loss_exponent"]
+        self.eta = max(values["loss"], MIN_LOSS_FACTOR) * power
+        """Loss factor (f,)."""
+        self.by_loss_of_rest = 1j * self.eta / (1 + 1j * self.eta)
+        """Derivative of the logarithm of the stiffness of the plate's rest by the loss factor
+        (f,)."""
         self.bending: ComplexArray | None = None
         """Stiffness between modes with form errors (f, r, r) [rad²/s²]; `added` is their mass."""
         if model.form is not None:
             stretch = np.append(values["side"], values["poisson"])
             stretched = np.einsum("g,grq->rq", stretch, model.form.stiffening)
-            self.bending = ((1 + 1j * eta) * modulus)[:, None, None] * stretched
-            shares = rig.mass * values["foreign_mass"][:, None]
-            self.added = model.form.cells.T @ (shares * model.form.cells)
-        stiffness = np.asarray(modulus * lossy, dtype=complex)
-        return model.free.receptance(model.omega, stiffness, eta, thickness, modulus)
+            self.bending = ((1 + 1j * self.eta) * self.modulus)[:, None, None] * stretched
+            cell_masses = plate.mass * values["foreign_mass"][:, None]
+            self.added = model.form.cells.T @ (cell_masses * model.form.cells)
+        stiffness = np.asarray(self.modulus * self._lossy_eigenvalues(), dtype=complex)
+        return model.free.receptance(model.omega, stiffness, self.eta, thickness, self.modulus)
+
+    def _lossy_eigenvalues(self) -> ComplexArray:
+        """Return the complex eigenvalues of all modes (f, r), and set their derivatives."""
+        values = self.values
+        theory = self.model.elasticity
+        shifted = self.model.shifted_modes
+        eigenvalues = theory.eigenvalues.copy()
+        eigenvalues[shifted] *= np.exp(values["mode_shifts"])
+        relative_loss = theory.relative_loss.copy()
+        relative_loss[shifted] *= np.exp(values["mode_losses"])
+        # Soft layers and air lose energy in addition to the plate's loss factor, and vary with
+        # their mode.
+        further_loss = theory.losses.copy()
+        further_loss[shifted] *= np.exp(values["mode_shifts"] + values["mode_losses"])
+        plate_loss: FloatArray = np.multiply.outer(self.eta, relative_loss) * eigenvalues
+        total_loss = plate_loss + further_loss
+        lossy = eigenvalues + 1j * total_loss
+        if theory.dispersion is not None:
+            lossy = lossy + theory.dispersion.at(self.model.omega)
+        self.by_loss = _quotient(1j * plate_loss, lossy)
+        """Derivatives of the logarithm of each mode's stiffness by the plate's loss factor (f,
+        r)."""
+        self.by_mode_loss = _quotient(1j * total_loss, lossy)
+        """The same by the total loss of the mode (f, r)."""
+        return lossy
 
     @property
     def reach_of_modes(self) -> tuple[ComplexArray, ComplexArray]:
@@ -649,12 +669,13 @@ class PlateAt:
         self, of_modes: ComplexArray | float, of_rest: ComplexArray | float
     ) -> ComplexArray:
         """Derivatives by a change of the log stiffness of modes (f, r) and of the rest (f,)."""
-        functions, seen, driven = self.functions, *self.reach_of_modes
-        change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
+        functions = self.functions
+        observed, driven = self.reach_of_modes
+        change = (observed * (of_modes * functions.elastic)[:, None]) @ driven
         if self.bending is not None:
-            change += seen @ (self.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
-        rest = np.asarray(of_rest)[..., None] * functions.truncated_by_log_q
-        further = self.by_free(combined(rest, self.located.truncated))
+            change += observed @ (self.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
+        truncated = np.asarray(of_rest)[..., None] * functions.truncated_by_log_q
+        further = self.by_free(combined(truncated, self.located.truncated))
         return self.responding(further - functions.thickness**3 * change)[..., None]
 
     @cached_property
@@ -676,9 +697,9 @@ class PlateAt:
 
     def by_modes(self, share: ComplexArray | float) -> ComplexArray:
         """Derivatives by the log eigenvalue of each shifting mode, times a factor (f, r)."""
-        modes, functions = self.model.shifted_modes, self.functions
+        modes = self.model.shifted_modes
         reach = self.reach[:, :, modes]
-        by_stiffness = -(functions.thickness**3) * functions.elastic
+        by_stiffness = -(self.functions.thickness**3) * self.functions.elastic
         return self.outer(reach, reach, (share * by_stiffness)[:, modes])
 
     def by_foreign_mass(self) -> ComplexArray:
@@ -694,14 +715,12 @@ class PlateAt:
         """Derivatives by relative length, width and Poisson's ratio, by index, through mode
         coupling."""
         assert self.model.form is not None  # noqa: S101  sides differ
-        factor, (seen, driven) = -(self.functions.q * self.functions.thickness), self.reach_of_modes
-        return np.stack(
-            [
-                self.responding(factor[:, None, None] * (seen @ slope @ driven))
-                for slope in self.model.form.stiffening[list(numbers)]
-            ],
-            axis=-1,
-        )
+        factor = -(self.functions.q * self.functions.thickness)[:, None, None]
+        observed, driven = self.reach_of_modes
+        slopes = []
+        for stiffening in self.model.form.stiffening[list(numbers)]:
+            slopes.append(self.responding(factor * (observed @ stiffening @ driven)))
+        return np.stack(slopes, axis=-1)
 
     @cached_property
     def by_places(self) -> ComplexArray:
@@ -709,41 +728,42 @@ class PlateAt:
 
         A position changes the receptance in its row and its column.
         """
-        located, moved = self.located, np.repeat(self.model.movable, 2)
+        located = self.located
         rows = located.shape_slopes @ self.moved
         rows = rows + combined(self.functions.truncated(TERMS), located.truncated_slopes)
-        reach, own = self.left @ rows.swapaxes(1, 2), self.left[:, :, moved]
+        reach = self.left @ rows.swapaxes(1, 2)
+        column = self.left[:, :, np.repeat(self.model.movable, 2)]
         ones = np.ones((len(self.model.omega), 1))
-        return self.outer(own, reach, ones) + self.outer(reach, own, ones)
+        return self.outer(column, reach, ones) + self.outer(reach, column, ones)
 
     def by_sources(self, kind: str) -> ComplexArray:
         """Derivatives by a value of each ERA, which also affects its force, (f, s, n, n)."""
-        none = np.zeros((2, len(self.model.omega)), dtype=complex)
-        slopes = np.array([each.get(kind, none) for each in self.source_slopes])
-        (change, of_force), eras = slopes.transpose(1, 2, 0), np.arange(len(slopes))
-        found = self.by_stiffness(eras, change)
-        found[:, :, eras, eras] += (
-            self.responses * (of_force / self.full_levels / self.force)[:, None]
-        )
-        return found
+        missing = np.zeros((2, len(self.model.omega)), dtype=complex)
+        slopes = np.array([slopes.get(kind, missing) for slopes in self.source_slopes])
+        stiffness_slopes, force_slopes = slopes.transpose(1, 2, 0)
+        eras = np.arange(len(slopes))
+        by_value = self.by_stiffness(eras, stiffness_slopes)
+        by_force = force_slopes / self.full_levels / self.force
+        by_value[:, :, eras, eras] += self.responses * by_force[:, None]
+        return by_value
 
     def by_masses(self) -> ComplexArray:
         """Derivatives by each additional mass, its x and y in turn, (f, s, n, 3 m)."""
-        n, count = len(self.sources), self.model.mass_count
-        at = self.model.movable[n : n + count]
-        by_mass = self.by_stiffness(at, -(self.model.omega[:, None] ** 2))[..., None]
-        by_place = self.by_places[..., 2 * n : 2 * (n + count)]
-        by_place = by_place.reshape(*by_mass.shape[:-1], 2)
+        first = len(self.sources)
+        last = first + self.model.mass_count
+        masses = self.model.movable[first:last]
+        by_mass = self.by_stiffness(masses, -(self.model.omega[:, None] ** 2))[..., None]
+        by_place = self.by_places[..., 2 * first : 2 * last].reshape(*by_mass.shape[:-1], 2)
         return np.concatenate([by_mass, by_place], axis=-1).reshape(*by_mass.shape[:3], -1)
 
     def by_drives(self, factor: ComplexArray | complex = 1.0) -> ComplexArray:
         """Derivatives by the logarithm of the gain of each drive, times a factor, (f, s, n, n)."""
-        return np.asarray(self.responses[..., None] * np.eye(len(self.sources)) * factor)
+        return self.responses[..., None] * np.eye(len(self.sources)) * factor
 
     @property
     def by_sensors(self) -> ComplexArray:
         """Derivatives by the logarithm of the gain of each sensor, (f, s, n, s)."""
-        return np.asarray(self.responses[..., None] * np.eye(len(self.model.sensors))[:, None])
+        return self.responses[..., None] * np.eye(len(self.model.sensors))[:, None]
 
     def by_stiffness(self, at: IntArray, change: AnyArray) -> ComplexArray:
         """Derivatives by changes (f, m) of the dynamic stiffness of attachments with indices
@@ -754,7 +774,7 @@ class PlateAt:
     def outer(self, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
         """Responses to T = factor u v^T, (f, s, n, m), for columns (f, a, m) and factors (f, m)."""
         left = u[:, self.model.observed] * factor[:, None]
-        return self.responding(np.asarray(left[:, :, None] * v[:, None, self.pushed]))
+        return self.responding(left[:, :, None] * v[:, None, self.pushed])
 
     @property
     def pushed(self) -> slice | IntArray:
@@ -768,15 +788,22 @@ class PlateAt:
         """Change of the responses (f, s, n, ...) due to a change of T (f, s, columns of `pushed`,
         ...)."""
         further = (1,) * (change.ndim - 3)
-        n, at = len(self.sources), np.arange(change.shape[1])
-        found = change[:, :, :n]
+        n = len(self.sources)
+        motion = change[:, :, :n]
         if self.lightness is not None:
             assert self.model.sensor_inertia is not None  # noqa: S101  there is a mass
+            sensors = np.arange(change.shape[1])
+            at_sensor = change[:, sensors, n + sensors][:, :, None]
             loaded = self.model.sensor_inertia[:, :, None] * self.loaded
-            own = change[:, at, n + at][:, :, None]
-            found = found + loaded.reshape(*loaded.shape, *further) * own
-            found = found * self.lightness.reshape(*self.lightness.shape, 1, *further)
-        return np.asarray(found * self.scale.reshape(*self.scale.shape, *further))
+            motion = motion + loaded.reshape(*loaded.shape, *further) * at_sensor
+            motion = motion * self.lightness.reshape(*self.lightness.shape, 1, *further)
+        return motion * self.scale.reshape(*self.scale.shape, *further)
+
+
+def _quotient(numerator: AnyArray, denominator: ComplexArray) -> ComplexArray:
+    """Return a quotient, 0 for a denominator of 0."""
+    zeros = np.zeros(denominator.shape, dtype=complex)
+    return np.divide(numerator, denominator, out=zeros, where=denominator != 0)
 
 
 def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
@@ -785,11 +812,12 @@ def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
     For a plate with form errors, at parameters x (p,).
     """
     plate = model.at(x)
-    own, viscous = _lossy(plate), _viscous(plate)
-    change = 1j * plate.eta[:, None, None] * (model.omega[:, None, None] * viscous - own)
+    omega = model.omega[:, None, None]
+    change = 1j * plate.eta[:, None, None] * (omega * _viscous(plate) - _lossy(plate))
+    viscous_plate = PlateAt(model, x, change)
     columns = plate.force.shape[1]
-    other = PlateAt(model, x, np.asarray(change))
-    return np.asarray((other.receptance - plate.receptance)[:, model.observed, :columns])
+    difference = viscous_plate.receptance - plate.receptance
+    return np.asarray(difference[:, model.observed, :columns])
 
 
 def _lossy(plate: PlateAt) -> FloatArray:
@@ -801,22 +829,25 @@ def _lossy(plate: PlateAt) -> FloatArray:
 def _viscous(plate: PlateAt) -> FloatArray:
     """Damping (r, r) [rad/s] equivalent to a loss factor of 1 for each supported mode at
     resonance."""
-    values, model, shapes = plate.values, plate.model, plate.located.shapes
-    rig, h = model.rig, plate.functions.thickness
-    springs = [each.in_time.stiffness for each in plate.sources]
-    masses = [each.in_time.mass for each in plate.sources]
-    factors = np.ones(len(rig.masses))
-    factors[list(rig.feet)] = values["supports"]
-    springs += [*factors * [load.stiffness for load in rig.masses]] + [0.0] * len(values["masses"])
-    masses += [load.mass for load in rig.masses] + [*values["masses"][:, 0]]
-    on_plate = shapes[: len(springs)]
+    rig = plate.model.rig
+    h = plate.functions.thickness
+    springs = [source.in_time.stiffness for source in plate.sources]
+    springs += [load.stiffness for load in rig.masses]
+    for foot, factor in zip(rig.feet, plate.values["supports"], strict=True):
+        springs[len(plate.sources) + foot] *= factor
+    added_masses = plate.values["masses"][:, 0].tolist()
+    springs += [0.0] * len(added_masses)
+    masses = [source.in_time.mass for source in plate.sources]
+    masses += [load.mass for load in rig.masses]
+    masses += added_masses
+    on_plate = plate.located.shapes[: len(springs)]
     lossy = _lossy(plate)
     stiffness = lossy + (on_plate.T * springs) @ on_plate / h
     mass = np.eye(len(lossy)) + (on_plate.T * masses) @ on_plate / h
     eigenvalues, modes = linalg.eigh(stiffness, mass)
     roots = np.maximum(eigenvalues, _SLOWEST**2) ** 0.25
     weighted = mass @ modes / roots
-    return np.asarray(weighted @ (modes.T @ lossy @ modes) @ weighted.T)
+    return weighted @ (modes.T @ lossy @ modes) @ weighted.T
 
 
 def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> ComplexArray:
@@ -825,12 +856,14 @@ def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> Compl
     searched (p,): mask of the requested parameters, default all; kinds without any get zeros.
     """
     space = plate.model.space
-    wanted = space.uncertain if searched is None else space.uncertain & searched
-    found = np.zeros((*plate.responses.shape, space.size), dtype=complex)
+    is_requested = space.uncertain
+    if searched is not None:
+        is_requested = is_requested & searched
+    derivatives = np.zeros((*plate.responses.shape, space.size), dtype=complex)
     for kind, part in space.groups.items():
-        if wanted[part].any():
-            found[..., part] = space.kinds[kind].derivative(plate) * space.std[part]
-    return found
+        if is_requested[part].any():
+            derivatives[..., part] = space.kinds[kind].derivative(plate) * space.std[part]
+    return derivatives
 
 
 def by_mass_at(plate: PlateAt, points: FloatArray) -> ComplexArray:

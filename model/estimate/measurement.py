@@ -42,6 +42,7 @@ from model.files.uff import (
 )
 from model.rig.rig import Rig
 from model.structure.attachments import GRAVITY
+from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
@@ -61,7 +62,8 @@ MAX_SENSOR_MASS = 500.0
 """Largest mass of a moved sensor [g]; a heavier one is not an accelerometer."""
 
 _UP = 3  # +z
-_GENERAL = 1  # a data type without one of its own
+_GENERAL = 1  # data type of any other quantity
+_FIRST_ERA_NODE = 1001
 # SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
 _ACCELERATION_UNITS = {
     **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
@@ -91,9 +93,8 @@ NONLINEAR = 0.02
 DRIFTED = 0.01
 """Relative difference of the first tone, played last again, beyond which a plate has changed."""
 
-# Of readings: their usual error, relative, and its floor,
-_NOISE = 0.01
-_FLOOR = 0.1  # of a sensor's rms: below it an error no longer falls with the response
+_NOISE = 0.01  # usual error of a reading, relative
+_FLOOR = 0.1  # of a sensor's RMS; below it the error no longer decreases with the response
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +141,6 @@ class Measurement:
     1, infinite for unknown gains. The phase is free if the magnitude is."""
     drives: tuple[int, ...] = ()
     """Index of the ERA that each of the n channels drives; empty if each drives its own."""
-    bases: ComplexArray | None = None
-    """Amplitude of each ERA (f, eras) if all play together as one channel, None if each plays
-    alone."""
 
     def __post_init__(self) -> None:
         """Raise InputError for unordered frequencies."""
@@ -152,12 +150,12 @@ class Measurement:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the sensors (s,)."""
-        return tuple(each.name for each in self.sensors)
+        return tuple(sensor.name for sensor in self.sensors)
 
     @property
     def points(self) -> FloatArray:
         """Positions of the sensors (s, 2) [m]."""
-        return np.array([(each.x, each.y) for each in self.sensors]).reshape(-1, 2)
+        return np.array([(sensor.x, sensor.y) for sensor in self.sensors]).reshape(-1, 2)
 
     @cached_property
     def std(self) -> FloatArray:
@@ -166,17 +164,21 @@ class Measurement:
         The default is 1 % of a response plus 1 % of a tenth of its sensor's RMS, since a response
         can be zero. Raises InputError for a standard error of zero.
         """
-        found = self.errors
-        if found is None:
-            measured = np.isfinite(self.values)
-            squares = np.where(measured, np.abs(self.values), 0.0) ** 2
-            count = measured.sum(axis=(0, 2))[:, None]
-            rms2 = squares.sum(axis=(0, 2))[:, None] / np.maximum(count, 1)
-            found = _NOISE * np.sqrt(squares + _FLOOR**2 * rms2)
-        least = np.where(np.isfinite(self.values), found, np.inf).min(initial=np.inf)
-        if not least > 0:
-            raise InputError(f"measurement: std must be above zero, got {least:g}")
-        return found
+        std = self.errors
+        if std is None:
+            std = self._default_errors()
+        smallest = np.where(np.isfinite(self.values), std, np.inf).min(initial=np.inf)
+        if not smallest > 0:
+            raise InputError(f"measurement: std must be above zero, got {smallest:g}")
+        return std
+
+    def _default_errors(self) -> FloatArray:
+        """Return the default standard errors (f, s, n); see `std`."""
+        measured = np.isfinite(self.values)
+        squares = np.where(measured, np.abs(self.values), 0.0) ** 2
+        count = measured.sum(axis=(0, 2))[:, None]
+        mean_square = squares.sum(axis=(0, 2))[:, None] / np.maximum(count, 1)
+        return np.asarray(_NOISE * np.sqrt(squares + _FLOOR**2 * mean_square))
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
@@ -196,9 +198,6 @@ class Measurement:
     def driven(self, responses: ComplexArray) -> ComplexArray:
         """Convert responses (f, s, eras, ...) to the ERAs, or their slopes, to those to the n
         channels."""
-        if self.bases is not None:
-            mixed = np.einsum("fse...,fe->fs...", responses, self.bases)
-            return np.asarray(mixed[:, :, None])
         return responses[:, :, list(self.drives)] if self.drives else responses
 
     @property
@@ -209,9 +208,9 @@ class Measurement:
     @cached_property
     def tone_rms(self) -> FloatArray:
         """RMS of the values at each tone, (f, 1, 1) [1/s²]."""
-        squares = np.where(self.known, np.abs(self.values) ** 2, 0.0)
-        count = self.known.sum(axis=(1, 2), keepdims=True)
-        return np.asarray(np.sqrt(squares.sum(axis=(1, 2), keepdims=True) / np.maximum(count, 1)))
+        squares = np.where(self.known, np.abs(self.values) ** 2, 0.0).sum(axis=(1, 2))
+        count = np.maximum(self.known.sum(axis=(1, 2)), 1)
+        return np.asarray(np.sqrt(squares / count))[:, None, None]
 
     def part(self, kept: NDArray[np.bool_]) -> Self:
         """Keep the values of a mask (f, s, n), with their errors."""
@@ -228,24 +227,30 @@ class Measurement:
 
     def moved(self, points: FloatArray) -> Self:
         """Return a copy with the sensors at other positions (s, 2) [m]."""
-        places = zip(self.sensors, points.tolist(), strict=True)
-        return replace(self, sensors=tuple(replace(each, x=x, y=y) for each, (x, y) in places))
+        sensors = []
+        for sensor, (x, y) in zip(self.sensors, points.tolist(), strict=True):
+            sensors.append(replace(sensor, x=x, y=y))
+        return replace(self, sensors=tuple(sensors))
 
     def check(self) -> None:
         """Raise InputError for a plate that was not linear or has changed during the
         measurement."""
-        for repeats, limit, cause in (
-            (self.half_level, NONLINEAR, "at half the level; measure at a lower level"),
-            (self.at_end, DRIFTED, "at the end; wait until the plate has settled, measure again"),
-        ):
-            for repeat in repeats:
-                size = np.linalg.norm(repeat.values)
-                difference = np.linalg.norm(repeat.repeated - repeat.values) / size
-                if not difference <= limit:
-                    raise InputError(
-                        f"response to ERA {repeat.era} at {repeat.frequency:g} Hz must stay within "
-                        f"{100 * limit:g} %, got {100 * difference:.1f} % {cause}"
-                    )
+        _check_repeats(self.half_level, NONLINEAR, "at half the level; measure at a lower level")
+        _check_repeats(
+            self.at_end, DRIFTED, "at the end; wait until the plate has settled, measure again"
+        )
+
+
+def _check_repeats(repeats: Sequence[Repeat], limit: float, cause: str) -> None:
+    """Raise InputError if responses to a tone that was measured twice differ too much."""
+    for repeat in repeats:
+        size = np.linalg.norm(repeat.values)
+        difference = np.linalg.norm(repeat.repeated - repeat.values) / size
+        if not difference <= limit:
+            raise InputError(
+                f"response to ERA {repeat.era} at {repeat.frequency:g} Hz must stay within "
+                f"{100 * limit:g} %, got {100 * difference:.1f} % {cause}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,9 +274,12 @@ def sensors_at(
     points: FloatArray, names: Sequence[str] = (), *, mass: float = 0.0
 ) -> tuple[Sensor, ...]:
     """Sensors at points (s, 2) [m] of the plate, by default numbered; mass: as `Sensor.mass`."""
-    called = names or [f"sensor {number}" for number in range(len(points))]
-    at = zip(called, np.asarray(points).tolist(), strict=True)
-    return tuple(Sensor(name, x=x, y=y, mass=mass) for name, (x, y) in at)
+    if not names:
+        names = [f"sensor {number}" for number in range(len(points))]
+    sensors = []
+    for name, (x, y) in zip(names, np.asarray(points).tolist(), strict=True):
+        sensors.append(Sensor(name, x=x, y=y, mass=mass))
+    return tuple(sensors)
 
 
 @dataclass(frozen=True)
@@ -309,79 +317,99 @@ def measurement_of(measured: Sequence[MeasuredValue], rig: Rig) -> Measurement:
     InputError, with file and line, for points off the plate, unknown ERAs or positions, duplicate
     responses, a sensor at two positions, and if no value is left.
     """
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    within = [each for each in measured if low <= each.frequency <= high]
-    skipped = len(measured) - len(within)
+    within = _within_limits(measured, rig)
+    first: dict[str, MeasuredValue] = {}
+    eras: dict[tuple[str, Point | None], int] = {}
+    responses: dict[tuple[float, int, str], complex] = {}
+    for response in within:
+        if response.sensor not in first:
+            _check_point(response, rig)
+            first[response.sensor] = response
+        _check_sensor(response, first[response.sensor])
+        drive = (response.era, response.era_point)
+        if drive not in eras:
+            eras[drive] = _era_of(response, rig)
+        number = eras[drive]
+        _check_unit(response, rig.eras[number])
+        path = (response.frequency, number, response.sensor)
+        if path in responses:
+            raise InputError(
+                f"{response.place}: response of sensor {response.sensor} to ERA "
+                f"{rig.eras[number].name} at {response.frequency:g} Hz must be given once, got two"
+            )
+        responses[path] = response.value
+    frequencies = np.unique([response.frequency for response in within])
+    values = np.full((len(frequencies), len(first), len(rig.eras)), np.nan, dtype=complex)
+    rows = {frequency: row for row, frequency in enumerate(frequencies.tolist())}
+    columns = {name: column for column, name in enumerate(first)}
+    for (frequency, number, sensor), value in responses.items():
+        values[rows[frequency], columns[sensor], number] = value
+    return Measurement(
+        sensors=tuple(_sensor_at(response, rig.plate) for response in first.values()),
+        frequencies=frequencies,
+        values=values,
+        drives_lag=True,
+        skipped=len(measured) - len(within),
+    )
+
+
+def _within_limits(measured: Sequence[MeasuredValue], rig: Rig) -> list[MeasuredValue]:
+    """Return the values within the rig's frequency limits; raises InputError if none is."""
+    low = rig.limits.frequency_min
+    high = rig.limits.frequency_max
+    within = [response for response in measured if low <= response.frequency <= high]
     limits = f"the rig's limits.frequency of {low:g} to {high:g} Hz"
     if measured and not within:
         raise InputError(
             f"{measured[0].place}: a frequency must be within {limits}, got "
             f"{measured[0].frequency:g} Hz; measure others or widen the limits"
         )
+    skipped = len(measured) - len(within)
     if skipped:
         _logger.warning("%d of %d values beyond %s are left out", skipped, len(measured), limits)
-    first: dict[str, MeasuredValue] = {}
-    eras: dict[tuple[str, tuple[float, float] | None], int] = {}
-    found: dict[tuple[float, int, str], complex] = {}
-    for each in within:
-        if each.sensor not in first:
-            _check_point(each, rig)
-        _check_sensor(each, first.setdefault(each.sensor, each))
-        if (each.era, each.era_point) not in eras:
-            eras[each.era, each.era_point] = _era_of(each, rig)
-        number = eras[each.era, each.era_point]
-        actuator = rig.eras[number]
-        if each.is_per_volt != (actuator.UNIT == "V"):
-            right, wrong = ("volt at the exciter", "displacement of the base of an ERA")
-            if each.is_per_volt:
-                right, wrong = wrong, right
-            raise InputError(
-                f"{each.place}: response to {actuator.name} must be acceleration per {right}, got "
-                f"per {wrong}; check the rig, or its unit"
-            )
-        if (each.frequency, number, each.sensor) in found:
-            raise InputError(
-                f"{each.place}: response of sensor {each.sensor} to ERA {rig.eras[number].name} "
-                f"at {each.frequency:g} Hz must be given once, got two"
-            )
-        found[each.frequency, number, each.sensor] = each.value
-    frequencies = np.unique([each.frequency for each in within])
-    values = np.full((len(frequencies), len(first), len(rig.eras)), np.nan, dtype=complex)
-    column = {name: number for number, name in enumerate(first)}
-    for (frequency, number, sensor), value in found.items():
-        values[np.searchsorted(frequencies, frequency), column[sensor], number] = value
-    # A point at the edge may have been rounded off the plate.
-    points = [each.point for each in first.values()]
-    points = np.clip(points, 0, [rig.plate.length, rig.plate.width]).tolist()
-    at = zip(first.values(), points, strict=True)
-    return Measurement(
-        tuple(Sensor(each.sensor, x=x, y=y, mass=each.sensor_mass) for each, (x, y) in at),
-        frequencies,
-        values,
-        drives_lag=True,
-        skipped=skipped,
+    return within
+
+
+def _sensor_at(measured: MeasuredValue, plate: Plate) -> Sensor:
+    """Return the sensor of a value; a point at the edge may have been rounded off the plate."""
+    x, y = np.clip(measured.point, 0, [plate.length, plate.width]).tolist()
+    return Sensor(measured.sensor, x=x, y=y, mass=measured.sensor_mass)
+
+
+def _check_unit(measured: MeasuredValue, era: Actuator) -> None:
+    """Raise InputError if a response is per volt at an ERA, or per displacement at an exciter."""
+    if measured.is_per_volt == (era.UNIT == "V"):
+        return
+    right, wrong = "volt at the exciter", "displacement of the base of an ERA"
+    if measured.is_per_volt:
+        right, wrong = wrong, right
+    raise InputError(
+        f"{measured.place}: response to {era.name} must be acceleration per {right}, got "
+        f"per {wrong}; check the rig, or its unit"
     )
 
 
 def _check_sensor(measured: MeasuredValue, first: MeasuredValue) -> None:
     """Raise InputError unless a sensor is where its first value has it, and weighs as much."""
-    of, before = f"{measured.place}: sensor {measured.sensor}", first.place
+    subject = f"{measured.place}: sensor {measured.sensor}"
     if math.dist(first.point, measured.point) > _EDGE_TOLERANCE:
         raise InputError(
-            f"{of} must have one position, got {_shown(first.point)} ({before}) and "
+            f"{subject} must have one position, got {_shown(first.point)} ({first.place}) and "
             f"{_shown(measured.point)} m; name sensors differently"
         )
     if measured.sensor_mass != first.sensor_mass:
         raise InputError(
-            f"{of} must have one mass, got {1e3 * first.sensor_mass:g} ({before}) and "
+            f"{subject} must have one mass, got {1e3 * first.sensor_mass:g} ({first.place}) and "
             f"{1e3 * measured.sensor_mass:g} g"
         )
 
 
 def _check_point(measured: MeasuredValue, rig: Rig) -> None:
-    plate, (x, y) = rig.plate, measured.point
-    within = _EDGE_TOLERANCE
-    if not (-within <= x <= plate.length + within and -within <= y <= plate.width + within):
+    plate = rig.plate
+    x, y = measured.point
+    is_within_length = -_EDGE_TOLERANCE <= x <= plate.length + _EDGE_TOLERANCE
+    is_within_width = -_EDGE_TOLERANCE <= y <= plate.width + _EDGE_TOLERANCE
+    if not (is_within_length and is_within_width):
         raise InputError(
             f"{measured.place}: sensor {measured.sensor} must be on the rig's plate, from "
             f"(0, 0) to ({plate.length:g}, {plate.width:g}) m, got {_shown(measured.point)} m; "
@@ -391,22 +419,22 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
 
 def _era_of(measured: MeasuredValue, rig: Rig) -> int:
     """Return the index of the driven ERA, found by name or else by position."""
-    at, names = measured.era_point, [era.name for era in rig.eras]
+    point = measured.era_point
+    names = [era.name for era in rig.eras]
     for number, era in enumerate(rig.eras):
-        near = at is not None and math.dist(at, (era.x, era.y)) <= _ERA_TOLERANCE
+        is_near = point is not None and math.dist(point, (era.x, era.y)) <= _ERA_TOLERANCE
         if era.name == measured.era:
-            if at is not None and not near:
+            if point is not None and not is_near:
                 raise InputError(
                     f"{measured.place}: ERA {era.name} must be at {_shown((era.x, era.y))} m, its "
-                    f"position in the rig, got {_shown(at)} m; check the plate"
+                    f"position in the rig, got {_shown(point)} m; check the plate"
                 )
             return number
-        if near and measured.era not in names:
+        if is_near and measured.era not in names:
             return number
-    known = ", ".join(f"{era.name} {_shown((era.x, era.y))}" for era in rig.eras)
-    raise InputError(
-        f"{measured.place}: ERA must be one of {known}, got {measured.era or _shown(at or (0, 0))}"
-    )
+    positions = ", ".join(f"{era.name} {_shown((era.x, era.y))}" for era in rig.eras)
+    unknown = measured.era or _shown(point or (0, 0))
+    raise InputError(f"{measured.place}: ERA must be one of {positions}, got {unknown}")
 
 
 def _shown(point: tuple[float, float]) -> str:
@@ -418,19 +446,21 @@ def silent_sensors(measurement: Measurement) -> NDArray[np.bool_]:
     size = np.abs(measurement.values)
     loudest = np.where(np.isfinite(size), size, 0).max(axis=1, keepdims=True)
     share = size / np.where(loudest > 0, loudest, np.nan)
-    heard = [typical(share[:, s]) for s in range(size.shape[1])]
-    return ~(np.array(heard) >= _SILENT_SENSOR)
+    level = np.array([typical(share[:, s]) for s in range(size.shape[1])])
+    return ~(level >= _SILENT_SENSOR)
 
 
 def check_enough_sensors(alive: NDArray[np.bool_], measurement: Measurement) -> None:
     """Raise InputError unless enough sensors (s,) have a signal."""
     if alive.sum() < LEAST_SENSORS:
-        dead = ", ".join(compress(measurement.names, ~alive))
-        without = f" ({dead} without a signal)" if dead else ""
-        raise InputError(
+        message = (
             f"at least {LEAST_SENSORS} sensors must have a signal (eight or more are better), got "
-            f"{alive.sum()}{without}"
+            f"{alive.sum()}"
         )
+        dead = ", ".join(compress(measurement.names, ~alive))
+        if dead:
+            message += f" ({dead} without a signal)"
+        raise InputError(message)
 
 
 def typical(values: NDArray[np.inexact]) -> float:
@@ -454,8 +484,10 @@ def write_responses(path: Path, measurement: Measurement, rig: Rig, *, setting: 
 
     Raises OSError.
     """
-    write = write_responses_csv if path.suffix.lower() == ".csv" else write_responses_uff
-    write(path, measurement, rig, setting=setting)
+    if path.suffix.lower() == ".csv":
+        write_responses_csv(path, measurement, rig, setting=setting)
+    else:
+        write_responses_uff(path, measurement, rig, setting=setting)
 
 
 def write_responses_csv(
@@ -471,97 +503,97 @@ def write_responses_csv(
     real, imaginary = _PER_VOLT if "V" in units else COLUMNS[-2:]
     measured = measurement.values.swapaxes(1, 2)
     f, e, s = np.nonzero(np.isfinite(measured))
-    values, points = measured[f, e, s], measurement.points
-    masses = np.array([each.mass for each in measurement.sensors])
-    further: dict[str, Column] = {}
+    values = measured[f, e, s]
+    points = measurement.points[s]
+    eras = [rig.eras[number] for number in e]
+    columns: dict[str, Column] = {
+        "era": [era.name for era in eras],
+        "era_x_m": [era.x for era in eras],
+        "era_y_m": [era.y for era in eras],
+        "sensor": [measurement.names[number] for number in s],
+        "x_m": points[:, 0],
+        "y_m": points[:, 1],
+        "frequency_hz": measurement.frequencies[f],
+        real: values.real,
+        imaginary: values.imag,
+    }
+    masses = np.array([sensor.mass for sensor in measurement.sensors])
     if masses.any():
-        further[_MASS] = 1e3 * masses[s]
+        columns[_MASS] = 1e3 * masses[s]
     if setting:
-        further[SETTING] = [setting] * len(s)
-    write_columns(
-        path,
-        {
-            "era": [rig.eras[number].name for number in e],
-            "era_x_m": [rig.eras[number].x for number in e],
-            "era_y_m": [rig.eras[number].y for number in e],
-            "sensor": [measurement.names[number] for number in s],
-            "x_m": points[s, 0],
-            "y_m": points[s, 1],
-            "frequency_hz": measurement.frequencies[f],
-            real: values.real,
-            imaginary: values.imag,
-            **further,
-        },
-    )
+        columns[SETTING] = [setting] * len(s)
+    write_columns(path, columns)
 
 
 def write_responses_uff(
     path: Path, measurement: Measurement, rig: Rig, *, setting: str = ""
 ) -> None:
-    """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
-    sensors = measurement.sensors
-    positions = [*((each.x, each.y) for each in sensors), *((era.x, era.y) for era in rig.eras)]
-    numbers = [*range(1, len(sensors) + 1), *range(1001, 1001 + len(rig.eras))]
+    """Write responses as UFF 58: nodes from 1 are sensors, nodes from 1001 ERAs; raises OSError."""
+    nodes = {}
+    for number, sensor in enumerate(measurement.sensors, start=1):
+        nodes[number] = (sensor.x, sensor.y, 0.0)
     functions = []
     for e, era in enumerate(rig.eras):
-        reference = (DISPLACEMENT if era.UNIT == "m" else _GENERAL, era.UNIT)
-        for s, sensor in enumerate(sensors):
+        nodes[_FIRST_ERA_NODE + e] = (era.x, era.y, 0.0)
+        data_type = DISPLACEMENT if era.UNIT == "m" else _GENERAL
+        for s, sensor in enumerate(measurement.sensors):
             values = measurement.values[:, s, e]
             measured = np.isfinite(values)
-            note = f"{_MASS}={1e3 * sensor.mass:.10g} {SETTING}={setting}"
+            note = ""
+            if setting or sensor.mass:
+                note = f"{_MASS}={1e3 * sensor.mass:.10g} {SETTING}={setting}"
             if measured.any():
                 functions.append(
                     Function(
-                        str(path),
-                        FREQUENCY_RESPONSE,
-                        s + 1,
-                        1001 + e,
-                        (sensor.name, era.name),
-                        (_UP, _UP),
-                        measurement.frequencies[measured],
-                        values[measured],
-                        (UFF_FREQUENCY, ACCELERATION, reference[0]),
-                        ("m/s^2", reference[1]),
-                        note=note if setting or sensor.mass else "",
+                        place=str(path),
+                        function_type=FREQUENCY_RESPONSE,
+                        response=s + 1,
+                        reference=_FIRST_ERA_NODE + e,
+                        names=(sensor.name, era.name),
+                        directions=(_UP, _UP),
+                        x=measurement.frequencies[measured],
+                        data=values[measured],
+                        data_types=(UFF_FREQUENCY, ACCELERATION, data_type),
+                        units=("m/s^2", era.UNIT),
+                        note=note,
                     )
                 )
-    nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, positions, strict=True)}
     write_universal(path, Universal(nodes, functions))
 
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
-    found = []
     optional = (*ERA_COLUMNS, _MASS, SETTING)
-    for line in read_lines(path, COLUMNS, optional=optional, instead=_PER_VOLT):
-        is_per_volt = _PER_VOLT[0] in line.cells
-        at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
-        if len(at_era) == 1:
-            raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
-        parts = _PER_VOLT if is_per_volt else COLUMNS[-2:]
-        x, y, frequency, real, imaginary = map(line.number, (*COLUMNS[2:-2], *parts))
-        era, sensor = line.cells["era"], line.cells["sensor"]
-        if not (era and sensor):
-            raise InputError(f"{line.place}: era and sensor must have names")
-        if frequency < 0:
-            raise InputError(f"{line.place}: frequency_hz must be 0 or more, got {frequency:g}")
-        era_point = (at_era[0], at_era[1]) if at_era else None
-        value = complex(real, imaginary)
-        mass, setting = line.number(_MASS, 0.0), line.cells.get(SETTING, "")
-        found.append(
-            MeasuredValue(
-                era,
-                sensor,
-                (x, y),
-                era_point,
-                frequency,
-                value,
-                line.place,
-                sensor_mass(line.place, mass),
-                setting,
-                is_per_volt,
-            )
-        )
-    return found
+    lines = read_lines(path, COLUMNS, optional=optional, instead=_PER_VOLT)
+    return [_csv_value(path, line) for line in lines]
+
+
+def _csv_value(path: Path, line: CsvLine) -> MeasuredValue:
+    era_numbers = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
+    if len(era_numbers) == 1:
+        raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
+    is_per_volt = _PER_VOLT[0] in line.cells
+    real, imaginary = _PER_VOLT if is_per_volt else COLUMNS[-2:]
+    point = (line.number("x_m"), line.number("y_m"))
+    frequency = line.number("frequency_hz")
+    value = complex(line.number(real), line.number(imaginary))
+    era = line.cells["era"]
+    sensor = line.cells["sensor"]
+    if not (era and sensor):
+        raise InputError(f"{line.place}: era and sensor must have names")
+    if frequency < 0:
+        raise InputError(f"{line.place}: frequency_hz must be 0 or more, got {frequency:g}")
+    return MeasuredValue(
+        era=era,
+        sensor=sensor,
+        point=point,
+        era_point=(era_numbers[0], era_numbers[1]) if era_numbers else None,
+        frequency=frequency,
+        value=value,
+        place=line.place,
+        sensor_mass=sensor_mass(line.place, line.number(_MASS, 0.0)),
+        setting=line.cells.get(SETTING, ""),
+        is_per_volt=is_per_volt,
+    )
 
 
 def _read_uff(path: Path) -> list[MeasuredValue]:
@@ -572,28 +604,74 @@ def _read_uff(path: Path) -> list[MeasuredValue]:
             f"{path}: file must have frequency responses (dataset 58, function type 4), got none; "
             "export acceleration over the base displacement of an ERA"
         )
-    named: dict[str, set[int]] = {}
+    nodes: dict[str, set[int]] = {}
     for function in functions:
-        named.setdefault(function.names[0], set()).add(function.response)
-    return [value for function in functions for value in _uff_values(function, content, named)]
+        name, _ = function.names
+        nodes.setdefault(name, set()).add(function.response)
+    measured = []
+    for function in functions:
+        measured += _uff_values(function, content, nodes)
+    return measured
 
 
 def _uff_values(
-    function: Function, content: Universal, named: dict[str, set[int]]
+    function: Function, content: Universal, nodes: dict[str, set[int]]
 ) -> list[MeasuredValue]:
+    """Return the values of a function; nodes: of the sensors, by name."""
     place = function.place
-    is_per_volt = function.data_types[2] == _GENERAL and function.units[1].lower() == "v"
-    is_known = is_per_volt or function.data_types[2] == DISPLACEMENT
-    if function.data_types[1] != ACCELERATION or not is_known:
-        raise InputError(
-            f"{place}: data types must be acceleration ({ACCELERATION}) over displacement "
-            f"({DISPLACEMENT}) of an ERA's base, or over volts ({_GENERAL}, in V) of an exciter, "
-            f"got {function.data_types[1]} over {function.data_types[2]}"
-        )
+    is_per_volt = _is_per_volt(function)
     scale = _unit(place, function.units[0], _ACCELERATION_UNITS)
     if not is_per_volt:
         scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
     hertz = _unit(place, function.abscissa_unit, _FREQUENCY_UNITS)
+    _check_function(function, content)
+    for direction in function.directions:
+        if direction < 0:
+            scale = -scale
+    sensor, era = function.names
+    if not sensor or len(nodes[sensor]) > 1:
+        sensor = f"{sensor or 'node'}:{function.response}"
+    x, y, _ = map(float, content.nodes[function.response])
+    era_point = None
+    if function.reference in content.nodes:
+        era_x, era_y, _ = map(float, content.nodes[function.reference])
+        era_point = (era_x, era_y)
+    mass, setting = _noted(function)
+    measured = []
+    for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True):
+        measured.append(
+            MeasuredValue(
+                era=era,
+                sensor=sensor,
+                point=(x, y),
+                era_point=era_point,
+                frequency=hertz * frequency,
+                value=scale * value,
+                place=place,
+                sensor_mass=mass,
+                setting=setting,
+                is_per_volt=is_per_volt,
+            )
+        )
+    return measured
+
+
+def _is_per_volt(function: Function) -> bool:
+    """Whether a function is per volt; raises InputError for another quantity."""
+    _, response_type, reference_type = function.data_types
+    is_per_volt = reference_type == _GENERAL and function.units[1].lower() == "v"
+    if response_type != ACCELERATION or not (is_per_volt or reference_type == DISPLACEMENT):
+        raise InputError(
+            f"{function.place}: data types must be acceleration ({ACCELERATION}) over displacement "
+            f"({DISPLACEMENT}) of an ERA's base, or over volts ({_GENERAL}, in V) of an exciter, "
+            f"got {response_type} over {reference_type}"
+        )
+    return is_per_volt
+
+
+def _check_function(function: Function, content: Universal) -> None:
+    """Raise InputError for a function without phases, direction or position."""
+    place = function.place
     if not np.iscomplexobj(function.data):
         raise InputError(f"{place}: response must be complex, got real; export it with phases")
     if any(abs(direction) not in (0, _UP) for direction in function.directions):
@@ -606,49 +684,27 @@ def _uff_values(
             f"{place}: node {function.response} must have a position; export nodes too (dataset 15 "
             "or 2411)"
         )
-    name, reference = function.names[0], content.nodes.get(function.reference)
-    if not name or len(named[name]) > 1:
-        name = f"{name or 'node'}:{function.response}"
-    scale *= math.prod(-1 if direction < 0 else 1 for direction in function.directions)
-    x, y, _ = content.nodes[function.response]
-    mass, setting = _noted(function)
-    era_point = None if reference is None else (float(reference[0]), float(reference[1]))
-    return [
-        MeasuredValue(
-            function.names[1],
-            name,
-            (float(x), float(y)),
-            era_point,
-            hertz * frequency,
-            scale * value,
-            place,
-            mass,
-            setting,
-            is_per_volt,
-        )
-        for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True)
-    ]
 
 
-def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
+def _unit(place: str, label: str, units: Mapping[str, float]) -> float:
     """Return the SI value of the unit with a given label; raises InputError."""
     plain = label.lower().translate(_SPELLED).replace("sec", "s")
-    if plain not in known:
-        spelled = ", ".join(filter(None, known))
+    if plain not in units:
+        spelled = ", ".join(filter(None, units))
         raise InputError(f"{place}: unit must be one of {spelled}, got {label!r}; export it so")
-    return known[plain]
+    return units[plain]
 
 
 def _noted(function: Function) -> tuple[float, str]:
     """Return sensor mass [kg] and setting from the free text of a function; raises InputError."""
-    found = _NOTE.search(function.note)
-    if found is None:
+    note = _NOTE.search(function.note)
+    if note is None:
         return 0.0, ""
     try:
-        mass = float(found["mass"])
+        mass = float(note["mass"])
     except ValueError:
         mass = math.nan
-    return sensor_mass(function.place, mass), (found["setting"] or "").strip()
+    return sensor_mass(function.place, mass), (note["setting"] or "").strip()
 
 
 def sensor_mass(place: str, grams: float, *, column: str = _MASS) -> float:
@@ -665,16 +721,16 @@ def read_places(path: Path, plate: Plate) -> dict[str, Point]:
     """Read positions of sensors [m] on a plate by name; raises InputError with file and line."""
     places: dict[str, Point] = {}
     for line in read_lines(path, PLACE_COLUMNS, optional=INPUT_COLUMNS):
-        name, at = named_place(line, places, plate)
-        places[name] = at
+        name, point = named_place(line, places, plate)
+        places[name] = point
     return places
 
 
-def named_place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, Point]:
-    """Return name and position of a sensor; raises InputError for a duplicate name."""
+def named_place(line: CsvLine, names: Collection[str], plate: Plate) -> tuple[str, Point]:
+    """Return name and position of a sensor; raises InputError for a name among earlier names."""
     name = line.cells["sensor"]
-    if not name or name in before:
+    if not name or name in names:
         raise InputError(f"{line.place}: sensor must be a name that no other has, got {name!r}")
-    at = line.number("x_m"), line.number("y_m")
-    check_on_plate(f"{line.place}: sensor {name}", [at], plate)
-    return name, at
+    point = (line.number("x_m"), line.number("y_m"))
+    check_on_plate(f"{line.place}: sensor {name}", [point], plate)
+    return name, point

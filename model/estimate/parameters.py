@@ -57,16 +57,12 @@ class StatedByRig(ParameterKind):
 class PlateParameter(ParameterKind):
     """Kind with a single parameter."""
 
-    label: str
-
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [self.label]
 
 
 class EraParameter(ParameterKind):
     """Kind with one parameter per ERA."""
-
-    label: str
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {era}" for era in scope.eras]
@@ -75,8 +71,6 @@ class EraParameter(ParameterKind):
 class SensorParameter(ParameterKind):
     """Kind with one parameter per sensor."""
 
-    label: str
-
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {sensor}" for sensor in scope.sensors]
 
@@ -84,16 +78,12 @@ class SensorParameter(ParameterKind):
 class ModeParameter(ParameterKind):
     """Kind with one parameter for each of the lowest elastic modes."""
 
-    label: str
-
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {n}" for n in range(1, scope.mode_count + 1)]
 
 
 class FormError(ParameterKind):
     """Kind that exists only on plates with form errors, exactly known for an installed rig."""
-
-    label: str
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return self.form_names(scope) if scope.has_form_errors else ()
@@ -157,7 +147,7 @@ class ThicknessFactor(StatedByRig, PlateParameter):
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
         by_mass = plate.responding(plate.by_free(plate.free_receptance))[..., None]
-        return np.asarray(2 * plate.by_log_rigidity - by_mass)
+        return 2 * plate.by_log_rigidity - by_mass
 
 
 class ModulusFactor(PlateParameter):
@@ -239,7 +229,7 @@ class LossExponent(PlateParameter):
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
         log_frequency = np.log(plate.model.frequencies / LOSS_FREQUENCY)
-        return np.asarray(log_frequency[:, None, None, None] * plate.by_log_loss)
+        return log_frequency[:, None, None, None] * plate.by_log_loss
 
 
 class ModeStiffness(ModeParameter):
@@ -602,7 +592,7 @@ class SensorPhase(SensorParameter):
     stage = 0
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
-        return np.asarray(1j * plate.by_sensors)
+        return 1j * plate.by_sensors
 
 
 # Form errors, which no rig file describes: inaccurate cutting, positions, and attached cables
@@ -714,7 +704,7 @@ class LossLaw(FormError):
 
     def derivative(self, plate: PlateAt) -> ComplexArray:
         law = 0.0 if plate.model.law is None else plate.model.law
-        return np.asarray((plate.scale * law)[..., None])
+        return (plate.scale * law)[..., None]
 
 
 ALL_KINDS: tuple[ParameterKind, ...] = (

@@ -4,42 +4,41 @@
 and wiring (`model.estimate.plate_match`), and returns a `Verdict` with the state of each channel
 and the findings of `model.estimate.findings`.
 
-Before a fit (`model.estimate.calibrate.check_consistency`), it also rejects responses that
-contradict their metadata. Each check looks for one error among the parameters that the fit leaves
-free.
+Before a fit (`model.estimate.screening`), it also rejects responses that contradict their
+metadata. Each check looks for one error among the parameters that the fit leaves free.
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import compress
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, best_by, best_of
+from model.arrays import ComplexArray, FloatArray, best_by, best_of
 from model.errors import InputError
 from model.estimate.findings import (
     MAX_FORM_ERROR,
     ChannelVerdict,
-    Correction,
     Finding,
     Verdict,
-    cycles,
-    exchanged_sensors,
     match_beyond,
-    other_meaning,
-    reversed_axes,
     with_findings,
 )
-from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
+from model.estimate.gains import gains_of, row_rms
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Measurement,
     check_enough_sensors,
     silent_sensors,
     typical,
+)
+from model.estimate.misread_files import (
+    Correction,
+    exchanged_sensors,
+    other_meaning,
+    reversed_axes,
 )
 from model.estimate.plate_match import (
     FALSE_ALARM,
@@ -56,17 +55,16 @@ from model.estimate.plate_match import (
     match_responses,
     match_shapes,
 )
-from model.quantities import percent
+from model.estimate.sensed_plate import SensedPlate, plate_of
 from model.rig.rig import Rig
 from model.structure.attachments import GRAVITY, Era, PointLoad
 from model.structure.exciter import Exciter
 from model.study.expected_contrast import promise_margins
-from model.study.verification import MIN_KEPT_SHARE
 
 STRONG = 1.25
 """Gain from which a channel is strong, or weak below its inverse: 2 dB.
 
-That is four times the variation of drives.
+That is four times the tolerance of drives.
 """
 
 LOOSE = 0.7
@@ -82,14 +80,16 @@ _MAX_PHASE_ERROR = 45.0  # degrees
 _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of the prediction; dead if the shape matches no ERA either
 _NO_SHAPE = 0.6  # MAC
+_DEAD_CONFIDENCE = 0.99
 _SENSOR_SCALE = (0.7, 1.4)
 _MUTE = 0.1  # of the others' scale
 _UPSIDE_DOWN = -0.5
-_MIN_CHANGE = 0.03  # relative, of a reported value
+_MORE_NOISE = 1.2  # model error of a second match, relative to the error of the first
+_MAX_MODEL_ERROR = 0.3
 
 _GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
 _RISES = 0.2  # of the logarithm of a gain over the frequencies
-_EXPLAINS = 0.6  # of the median deviation without glue
+_EXPLAINS = 0.6  # of the median residual without glue
 _MIN_CHANNELS = 3  # whose median shows a common error of the amplifier
 
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
@@ -112,6 +112,16 @@ They are factor * (i omega)^power times acceleration per displacement.
 """
 
 
+@dataclass(frozen=True)
+class _Options:
+    """Options of `diagnose`."""
+
+    false_alarm: float
+    has_form: bool
+    refuses: bool
+    skipped: tuple[Finding, ...]
+
+
 def diagnose(
     rig: Rig,
     observation: Measurement,
@@ -124,35 +134,23 @@ def diagnose(
     """Compare a measurement with the rig's prediction.
 
     - false_alarm: false-alarm rate on correct plates.
-    - has_form: whether to include form errors, and search for deviations beyond their tolerances
+    - has_form: whether to include form errors, and search for differences beyond their tolerances
       (needs sensors of known scale).
     - refuses: whether responses that contradict their metadata are an error.
     - skipped: findings about sensors that were left out before.
 
     Raises InputError for fewer than three usable sensors or four frequencies.
     """
-    plate, observation, dead, silent = _heard(rig, observation)
-    skipped += silent
-
-    def corrected(found: Correction, *, has_form: bool) -> Verdict:
-        """Return the verdict on the corrected rig and measurement, including the error found."""
-        correction, rig, observation = found
-        if refuses:
-            raise InputError(correction.rows[0].partition(": ")[2])
-        verdict = diagnose(
-            rig, observation, false_alarm=false_alarm, has_form=has_form, skipped=skipped
-        )
-        return replace(verdict, findings=(correction, *verdict.findings))
-
+    plate, observation, dead, silent = _without_silent_sensors(rig, observation)
+    options = _Options(false_alarm, has_form, refuses, skipped + silent)
     live = replace(observation, values=np.where(dead, np.nan, observation.values))
     shapes = match_shapes(plate, live.values)
-    if reverse := reversed_axes(plate, shapes, live, may_be_plugs=refuses):
-        return corrected(reverse, has_form=has_form)
-    if other := other_meaning(plate, shapes, live):
-        verdict = corrected((*other[:2], observation), has_form=False)
-        # The board of the file is corrected first.
-        kept = tuple(each for each in verdict.findings if each.about != "plate")
-        return replace(verdict, findings=kept, plate_matches=False, changes=None)
+    reverse = reversed_axes(plate, shapes, live, may_be_plugs=refuses)
+    if reverse:
+        return _corrected(reverse, options)
+    misread = other_meaning(plate, shapes, live)
+    if misread:
+        return _corrected_board(misread, observation, options)
     if dead.any():
         shapes = match_shapes(plate, observation.values)
     if refuses:
@@ -161,40 +159,33 @@ def diagnose(
     dead |= _dead_channels(plate, observation.values, shapes)
     values = np.where(dead, np.nan, observation.values)
     if not np.isfinite(values).any():
-        channels = tuple(_without_response(rig, n, is_dead=bool(dead[n])) for n in range(len(dead)))
-        return with_findings(Verdict(channels, observation.names, observation.frequencies, skipped))
+        return _verdict_without_response(rig, observation, dead, options)
     shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
     match = best_wiring(plate, values, shapes)
-    if exchanged := exchanged_sensors(match, observation):
-        return corrected(exchanged, has_form=has_form)
-    # With more noise than usual parameters are less certain.
-    error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
-    if error > MODEL_ERROR:
-        match = match_plate(
-            plate, values, drives=match.drives, model_error=error, starts=shapes.starts
-        )
-    off = _off_scale(match)
-    if off and len(observation.names) - len(off) >= LEAST_SENSORS:
-        wrong = np.isin(observation.names, [each.of for each in off])
+    exchanged = exchanged_sensors(match, observation)
+    if exchanged:
+        return _corrected(exchanged, options)
+    match = _matched_to_noise(match, shapes)
+    off_scale = _off_scale_sensors(match)
+    if off_scale and len(observation.names) - len(off_scale) >= LEAST_SENSORS:
+        is_off = np.isin(observation.names, [finding.of for finding in off_scale])
         return diagnose(
             rig,
-            observation.without(wrong),
+            observation.without(is_off),
             false_alarm=false_alarm,
             has_form=has_form,
-            skipped=(*skipped, *off),
+            skipped=(*options.skipped, *off_scale),
         )
-    return _matched_verdict(
-        match, observation, dead, has_form=has_form, false_alarm=false_alarm, skipped=skipped
-    )
+    return _matched_verdict(match, observation, dead, options)
 
 
-def _heard(
+def _without_silent_sensors(
     rig: Rig, observation: Measurement
 ) -> tuple[SensedPlate, Measurement, NDArray[np.bool_], tuple[Finding, ...]]:
     """Leave out silent sensors.
 
-    Returns the rig's plate at the others, what these measured, a mask (n,) of dead channels and the
-    findings of the silent ones. Raises InputError where too little is left to say anything.
+    Returns the rig's plate, the measurement, a mask (n,) of dead channels, and the findings. Raises
+    InputError if too few sensors or frequencies remain for a diagnosis.
     """
     if not np.isfinite(observation.values).any():
         raise InputError("no channel was driven; drive each in turn and measure again")
@@ -211,43 +202,102 @@ def _heard(
     if not live.count or not silent.any():
         return plate, observation, dead, ()
     check_enough_sensors(~silent, observation)
-    found = tuple(Finding("silent", name) for name in compress(observation.names, silent))
-    observation = observation.without(silent)
-    return plate_of(rig, observation), observation, dead, found
+    findings = tuple(Finding("silent", name) for name in compress(observation.names, silent))
+    audible = observation.without(silent)
+    return plate_of(rig, audible), audible, dead, findings
+
+
+def _corrected(correction: Correction, options: _Options) -> Verdict:
+    """Return the verdict on a corrected rig and measurement, including the error of the file."""
+    finding, rig, observation = correction
+    if options.refuses:
+        raise InputError(finding.rule)
+    verdict = diagnose(
+        rig,
+        observation,
+        false_alarm=options.false_alarm,
+        has_form=options.has_form,
+        skipped=options.skipped,
+    )
+    return replace(verdict, findings=(finding, *verdict.findings))
+
+
+def _corrected_board(
+    correction: Correction, observation: Measurement, options: _Options
+) -> Verdict:
+    """Return the verdict on a board whose file has a value the wrong way round.
+
+    Only the file is judged; the plate is checked after it is corrected. observation: including
+    dead channels.
+    """
+    finding, rig, _ = correction
+    verdict = _corrected((finding, rig, observation), replace(options, has_form=False))
+    findings = tuple(finding for finding in verdict.findings if finding.about != "plate")
+    return replace(verdict, findings=findings, plate_matches=False, changes=None)
+
+
+def _verdict_without_response(
+    rig: Rig, observation: Measurement, dead: NDArray[np.bool_], options: _Options
+) -> Verdict:
+    """Return the verdict if no channel moves the plate."""
+    channels = []
+    for number, is_dead in enumerate(dead.tolist()):
+        channels.append(_without_response(rig, number, is_dead=is_dead))
+    return with_findings(
+        Verdict(tuple(channels), observation.names, observation.frequencies, options.skipped)
+    )
+
+
+def _matched_to_noise(match: Match, shapes: ShapeMatch) -> Match:
+    """Match again if there is more noise than usual, because parameters are then less certain."""
+    error = float(np.clip(_MORE_NOISE * match.median_error, MODEL_ERROR, _MAX_MODEL_ERROR))
+    if error <= MODEL_ERROR:
+        return match
+    return match_plate(
+        match.plate, match.values, drives=match.drives, model_error=error, starts=shapes.starts
+    )
 
 
 def _matched_verdict(
-    match: Match,
-    observation: Measurement,
-    dead: NDArray[np.bool_],
-    *,
-    false_alarm: float,
-    has_form: bool,
-    skipped: tuple[Finding, ...],
+    match: Match, observation: Measurement, dead: NDArray[np.bool_], options: _Options
 ) -> Verdict:
     """Judge the plate of a match, then the channels by the plate that explains them best.
 
-    dead: mask (n,) of dead channels; further parameters as `diagnose`.
+    dead: mask (n,) of dead channels.
     """
-    rig, nominal, beyond = match.plate.rig, match, list[Finding]()
-    if has_form:
+    rig = match.plate.rig
+    nominal = match
+    beyond: list[Finding] = []
+    if options.has_form:
         with_form, beyond = match_beyond(match)
-        match = with_form if with_form.error <= MAX_FORM_ERROR else match
+        if with_form.error <= MAX_FORM_ERROR:
+            match = with_form
     # Values that absorb an even less likely form error prove nothing on their own.
-    limit = min([false_alarm, *(each.chance for each in beyond)])
-    matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
-    hypotheses = [] if matches else compared(nominal)
-    fitted = likeliest([match, *(each.match for each in hypotheses)])
-    loose = _behind_glue(fitted) | (set() if matches else _loosened(match, hypotheses))
+    limit = min([options.false_alarm, *(finding.chance for finding in beyond)])
+    plate_matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
+    findings = options.skipped
+    hypotheses: list[Hypothesis] = []
+    if plate_matches:
+        findings += tuple(beyond)
+    else:
+        hypotheses = compared(nominal)
+    fitted = likeliest([match, *(hypothesis.match for hypothesis in hypotheses)])
+    loose = _behind_glue(fitted)
+    if not plate_matches:
+        loose |= _loosened(match, hypotheses)
+    changes = None
+    if match.error <= MAX_FIT_ERROR:
+        changes = plate_changes(rig, match)
+    channels = _channels(fitted, rig, loose, dead, has_phases=observation.has_phases)
     verdict = Verdict(
-        tuple(_channels(fitted, rig, loose, dead, has_phases=observation.has_phases)),
-        observation.names,
-        observation.frequencies,
-        (*skipped, *(beyond if matches else ())),
-        matches,
-        match,
-        tuple(hypotheses),
-        plate_changes(rig, match) if match.error <= MAX_FIT_ERROR else None,
+        channels=tuple(channels),
+        sensors=observation.names,
+        frequencies=observation.frequencies,
+        findings=findings,
+        plate_matches=plate_matches,
+        match=match,
+        hypotheses=tuple(hypotheses),
+        changes=changes,
     )
     return with_findings(verdict)
 
@@ -259,31 +309,40 @@ def _dead_channels(
 
     shapes: if given, weak channels without the shape of an ERA, whose response is noise, count too.
     """
-    share = np.abs(values / plate.responses())
-    size = np.array([typical(share[..., number]) for number in range(share.shape[2])])
-    dead = size < _DEAD
+    relative = np.abs(values / plate.responses())
+    size = np.array([typical(relative[..., number]) for number in range(relative.shape[2])])
+    dead: NDArray[np.bool_] = size < _DEAD
     if shapes is not None:
-        best = np.nan_to_num(shapes.medians).max(axis=1)
-        dead |= (size < _FAINT) & (best < _NO_SHAPE)
-    return np.asarray(dead)
+        best_mac = np.nan_to_num(shapes.medians).max(axis=1)
+        dead |= (size < _FAINT) & (best_mac < _NO_SHAPE)
+    return dead
 
 
-def _off_scale(match: Match) -> list[Finding]:
+def _off_scale_sensors(match: Match) -> list[Finding]:
     """Find sensors whose scale differs from the others', if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
-    known = np.isfinite(match.values) & np.isfinite(match.predicted) & ~match.outliers
-    model, measured = np.where(known, match.predicted, 0), np.where(known, match.values, 0)
+    is_used = np.isfinite(match.values) & np.isfinite(match.predicted) & ~match.outliers
+    model = np.where(is_used, match.predicted, 0)
+    measured = np.where(is_used, match.values, 0)
     inner = model.conj() * measured
     inner = inner * np.exp(-1j * np.angle(inner.sum(axis=1, keepdims=True)))
     power = (np.abs(model) ** 2).sum(axis=(0, 2))
     scales = inner.real.sum(axis=(0, 2)) / np.maximum(power, 1e-300)
-    found, names = [], match.fit.measurement.names
-    for name, scale in zip(names, (scales / np.median(scales)).tolist(), strict=True):
-        if not _SENSOR_SCALE[0] <= scale <= _SENSOR_SCALE[1]:
-            kind = "mute" if abs(scale) < _MUTE else "off scale"
-            found.append(Finding("upside down" if scale < _UPSIDE_DOWN else kind, name, scale))
-    return found
+    scales = scales / np.median(scales)
+    lowest, highest = _SENSOR_SCALE
+    findings = []
+    for name, scale in zip(match.fit.measurement.names, scales.tolist(), strict=True):
+        if not lowest <= scale <= highest:
+            findings.append(Finding(_scale_fault(scale), name, scale))
+    return findings
+
+
+def _scale_fault(scale: float) -> str:
+    """Return the kind of finding for a sensor with a scale."""
+    if scale < _UPSIDE_DOWN:
+        return "upside down"
+    return "mute" if abs(scale) < _MUTE else "off scale"
 
 
 def _channels(
@@ -294,55 +353,78 @@ def _channels(
     loose: indices of channels with a loose exciter; dead (n,): mask of channels; has_phases:
     whether phases are relative to the drives.
     """
-    shapes, values = match_responses(match.responses, match.values), match.values
-    predicted, known = np.where(match.outliers, np.nan, match.predicted), rig.uncertainty
-    for n, driven in enumerate(match.drives):
-        era, own = rig.eras[n], rig.eras[driven]
-        if dead[n] or not np.isfinite(values[..., n]).any():
-            yield _without_response(rig, n, is_dead=bool(dead[n]))
+    shapes = match_responses(match.responses, match.values)
+    predicted = np.where(match.outliers, np.nan, match.predicted)
+    for number, driven in enumerate(match.drives):
+        values = match.values[..., number]
+        if dead[number] or not np.isfinite(values).any():
+            yield _without_response(rig, number, is_dead=bool(dead[number]))
             continue
-        # Commands are shares of the stroke of the ERA to which the rig wires the channel.
-        gain = float(match.gains[n]) * era.full_level / own.full_level
-        gain /= float(np.median(np.abs(own.gain(match.plate.model.frequencies))))
-        others = (other for other in range(len(dead)) if other != driven)
-        confidence = min(shapes.confidence(n, driven, other) for other in others)
         phase, coherence = None, 0.0
         if has_phases:
-            phase, coherence = mean_phase(values[..., n], predicted[..., n])
-        states = ["other ERA"] if driven != n else []
-        # Responses cannot separate a force factor from a gain.
-        varies = 0.0 if isinstance(era, Era) else known.stiffness
-        strong = max(STRONG, math.exp(_GAIN_STDS * math.hypot(known.gain, varies)))
-        if not 1 / strong <= gain <= strong:
-            states.append("weak" if gain < 1 else "strong")
-        if phase is not None and abs(phase) >= 90:
-            states.append("inverted")
+            phase, coherence = mean_phase(values, predicted[..., number])
+        gain = _relative_gain(match, rig, number)
+        states = _phase_states(phase)
+        if not 1 / _strong_gain(rig, number) <= gain <= _strong_gain(rig, number):
+            states.insert(0, "weak" if gain < 1 else "strong")
+        if driven != number:
+            states.insert(0, "other ERA")
+        if number in loose:
+            states = ["loose", *(state for state in states if state != "weak")]
+        rivals = [rival for rival in range(len(dead)) if rival != driven]
+        confidence = min(shapes.confidence(number, driven, rival) for rival in rivals)
+        if "inverted" in states:
             confidence = min(confidence, coherence)
-        elif phase is not None and abs(phase) > _MAX_PHASE_ERROR:
-            states.append("out of phase")
-        if n in loose:
-            states = ["loose", *(each for each in states if each != "weak")]
-        wired, mac = rig.wiring[era.name], shapes.medians[n]
+        era = rig.eras[number]
+        wired = rig.wiring[era.name]
+        mac = shapes.medians[number]
         yield ChannelVerdict(
-            era.name,
-            wired.amplifier,
-            wired.number,
-            tuple(states) or ("well",),
-            own.name,
-            gain,
-            phase,
-            float(mac[n]),
-            float(mac[driven]),
-            confidence,
+            era=era.name,
+            amplifier=wired.amplifier,
+            channel=wired.number,
+            states=tuple(states) or ("well",),
+            drives=rig.eras[driven].name,
+            gain=gain,
+            phase=phase,
+            mac_own=float(mac[number]),
+            mac_found=float(mac[driven]),
+            confidence=confidence,
         )
+
+
+def _relative_gain(match: Match, rig: Rig, number: int) -> float:
+    """Return the gain of a channel relative to the gain of the ERA that it drives."""
+    era = rig.eras[number]
+    driven = rig.eras[match.drives[number]]
+    # Commands are shares of the stroke of the ERA to which the rig wires the channel.
+    gain = float(match.gains[number]) * era.full_level / driven.full_level
+    return gain / float(np.median(np.abs(driven.gain(match.plate.frequencies))))
+
+
+def _strong_gain(rig: Rig, number: int) -> float:
+    """Return the gain from which a channel is strong."""
+    uncertainty = rig.uncertainty
+    # Responses cannot separate a force factor from a gain.
+    force_std = 0.0 if isinstance(rig.eras[number], Era) else uncertainty.stiffness
+    return max(STRONG, math.exp(_GAIN_STDS * math.hypot(uncertainty.gain, force_std)))
+
+
+def _phase_states(phase: float | None) -> list[str]:
+    """Return the problem of a phase error [degrees], if it is one."""
+    if phase is None or abs(phase) <= _MAX_PHASE_ERROR:
+        return []
+    return ["inverted"] if abs(phase) >= 90 else ["out of phase"]
 
 
 def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict:
     """Verdict on a channel that is dead or was not driven."""
     name = rig.eras[number].name
     wired = rig.wiring[name]
-    found = ChannelVerdict(name, wired.amplifier, wired.number, ("not driven",))
-    return replace(found, states=("dead",), gain=0.0, confidence=0.99) if is_dead else found
+    if not is_dead:
+        return ChannelVerdict(name, wired.amplifier, wired.number, ("not driven",))
+    return ChannelVerdict(
+        name, wired.amplifier, wired.number, ("dead",), gain=0.0, confidence=_DEAD_CONFIDENCE
+    )
 
 
 def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float | None, float]:
@@ -354,9 +436,12 @@ def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float |
     products = predicted.conj() * measured
     inner = np.where(np.isfinite(products), products, 0).sum(axis=1)
     inner = inner[np.abs(inner) > 0]
-    mean = complex(np.mean(inner / np.abs(inner))) if len(inner) else 0j
-    reliable = abs(mean) >= _MIN_COHERENCE
-    return (math.degrees(np.angle(mean)) if reliable else None), abs(mean)
+    if not len(inner):
+        return None, 0.0
+    mean = complex(np.mean(inner / np.abs(inner)))
+    if abs(mean) < _MIN_COHERENCE:
+        return None, abs(mean)
+    return math.degrees(np.angle(mean)), abs(mean)
 
 
 def _loosened(match: Match, hypotheses: Sequence[Hypothesis]) -> set[int]:
@@ -364,13 +449,21 @@ def _loosened(match: Match, hypotheses: Sequence[Hypothesis]) -> set[int]:
 
     Each acts with less than its own stiffness.
     """
-    rig, rows = match.plate.rig, match.plate.rows
-    farthest = rows[best_of(np.abs(match.z))].era
-    shares = [(each.era, each.value / each.expected) for each in hypotheses[:1] if each.era]
-    acts = [row for row in rows if row.era and row.era == farthest and row.is_factor]
-    shares += [(row.era, row.of(match.rig) / row.of(rig)) for row in acts]
-    found = {era for era, share in shares if share <= LOOSE and isinstance(rig.era(era), Exciter)}
-    return {n for n, number in enumerate(match.drives) if rig.eras[number].name in found}
+    rig = match.plate.rig
+    parameters = match.plate.parameters
+    farthest = parameters[best_of(np.abs(match.z))].era
+    shares = []
+    for hypothesis in hypotheses[:1]:
+        if hypothesis.era:
+            shares.append((hypothesis.era, hypothesis.value / hypothesis.expected))
+    for parameter in parameters:
+        if parameter.era and parameter.era == farthest and parameter.is_factor:
+            shares.append((parameter.era, parameter.of(match.rig) / parameter.of(rig)))
+    loose = set()
+    for era, share in shares:
+        if share <= LOOSE and isinstance(rig.era(era), Exciter):
+            loose.add(era)
+    return {n for n, number in enumerate(match.drives) if rig.eras[number].name in loose}
 
 
 def _behind_glue(match: Match) -> set[int]:
@@ -380,28 +473,33 @@ def _behind_glue(match: Match) -> set[int]:
     stiffness D of the exciter decreases above the resonance of the magnet: the gain rises with
     frequency. A change common to all channels comes from the amplifier.
     """
-    drives, kept = match.drives, np.where(match.outliers, np.nan, match.values)
-    gains = np.abs(gains_of(match.responses[..., drives], kept))
+    values = np.where(match.outliers, np.nan, match.values)
+    gains = np.abs(gains_of(match.responses[..., match.drives], values))
     sizes = np.log(np.where(gains > 0, gains, np.nan))
-    driven: NDArray[np.bool_] = np.asarray(np.isfinite(sizes).any(axis=0))
-    if driven.sum() < _MIN_CHANNELS:
+    driven = np.flatnonzero(np.isfinite(sizes).any(axis=0)).tolist()
+    if len(driven) < _MIN_CHANNELS:
         return set()
     sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
-    found = set()
-    for n in np.flatnonzero(driven).tolist():
-        era, others = match.rig.eras[drives[n]], driven & (np.arange(len(drives)) != n)
-        own = sizes[:, n] - np.nanmedian(sizes[:, others], axis=1)
-        if isinstance(era, Exciter):
-            stiffness = era.dynamic_stiffness(match.plate.model.omega)
-            through = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
-            left = np.vstack([own, own - through])
-            left -= np.nanmedian(left, axis=1, keepdims=True)
-            without, *behind = np.nanmedian(np.abs(left), axis=1).tolist()
-            best = int(np.argmin(behind))
-            rise = np.ptp(through[best][np.isfinite(own)])
-            if behind[best] < _EXPLAINS * without and rise > _RISES:
-                found.add(n)
-    return found
+    glued = set()
+    for number in driven:
+        rivals = [rival for rival in driven if rival != number]
+        size = sizes[:, number] - np.nanmedian(sizes[:, rivals], axis=1)
+        exciter = match.rig.eras[match.drives[number]]
+        if isinstance(exciter, Exciter) and _rises_like_glue(size, exciter, match.plate.omega):
+            glued.add(number)
+    return glued
+
+
+def _rises_like_glue(size: FloatArray, exciter: Exciter, omega: FloatArray) -> bool:
+    """Whether a spring of glue explains the logarithms of an exciter's gains (f,) clearly."""
+    stiffness = exciter.dynamic_stiffness(omega)
+    transmitted = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
+    residuals = np.vstack([size, size - transmitted])
+    residuals -= np.nanmedian(residuals, axis=1, keepdims=True)
+    without_glue, *with_glue = np.nanmedian(np.abs(residuals), axis=1).tolist()
+    best = int(np.argmin(with_glue))
+    rise = np.ptp(transmitted[best][np.isfinite(size)])
+    return bool(with_glue[best] < _EXPLAINS * without_glue and rise > _RISES)
 
 
 def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
@@ -411,9 +509,12 @@ def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
     """
     changes = {}
     for kind in ("modulus", "loss_factor", "stiffness", "damping"):
-        rows = [row for row in match.plate.rows if row.kind == kind and row.of(rig)]
-        if rows:
-            changes[kind] = float(np.mean([row.of(match.rig) / row.of(rig) - 1 for row in rows]))
+        relative = []
+        for parameter in match.plate.parameters:
+            if parameter.kind == kind and parameter.of(rig):
+                relative.append(parameter.of(match.rig) / parameter.of(rig) - 1)
+        if relative:
+            changes[kind] = float(np.mean(relative))
     return changes
 
 
@@ -427,11 +528,14 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
         return verdict
     # The plate of a table has no finger on it.
     loads: list[object] = [*verdict.match.rig.masses]
-    masses = tuple(each for each in loads if isinstance(each, PointLoad))
+    masses = tuple(load for load in loads if isinstance(load, PointLoad))
     margins = promise_margins(rig, replace(verdict.match.rig, masses=masses))
-    missed = -float(np.median(margins)) if margins else 0.0
-    found = [Finding("promise", "table", missed)] if missed > MISSED_DB else []
-    return replace(verdict, promise_margins=margins, findings=(*verdict.findings, *found))
+    findings = verdict.findings
+    if margins:
+        missed = -float(np.median(margins))
+        if missed > MISSED_DB:
+            findings = (*findings, Finding("promise", "table", missed))
+    return replace(verdict, promise_margins=margins, findings=findings)
 
 
 def check_meaning(rig: Rig, measurement: Measurement) -> None:
@@ -442,28 +546,31 @@ def check_meaning(rig: Rig, measurement: Measurement) -> None:
     measurement.check()
     observation = replace(measurement, errors=None, has_phases=False)  # bases lag
     plate = plate_of(rig, observation)
-    found = other_meaning(plate, match_shapes(plate, observation.values), observation)
-    if found:
-        raise InputError(found[0].rows[0].partition(": ")[2])
+    misread = other_meaning(plate, match_shapes(plate, observation.values), observation)
+    if misread:
+        finding, _, _ = misread
+        raise InputError(finding.rule)
 
 
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
     """Raise InputError if the gains of all channels indicate another quantity or unit."""
-    model = plate.model.at(plate.moved(*shapes.start)).responses[..., shapes.nearest]
+    model = plate.responses(plate.start(*shapes.start))[..., shapes.nearest]
     gains = gains_of(model, values)
     size = np.log(row_rms(values) / row_rms(model))[:, 0]
-    known = np.isfinite(gains)
-    omega = plate.model.omega[:, None]
+    is_driven = np.isfinite(gains)
+    omega = plate.omega[:, None]
 
     def distance(factor: float, power: int) -> float:
         """Return the distance of gains from a quantity's gains, in size and phase."""
         expected = factor * (1j * omega) ** power
-        off = np.abs(size - np.log(np.abs(expected)))[known]
-        phase = np.angle(gains / expected)[known]
-        return float(np.median(off) + 1 - np.median(np.cos(phase)))
+        size_error = np.abs(size - np.log(np.abs(expected)))[is_driven]
+        phase_error = np.angle(gains / expected)[is_driven]
+        return float(np.median(size_error) + 1 - np.median(np.cos(phase_error)))
 
-    level = float(np.median(size[known]))
-    name, remedy, factor, power = best_by(_QUANTITIES, lambda each: -distance(*each[2:]))
+    level = float(np.median(size[is_driven]))
+    name, remedy, factor, power = best_by(
+        _QUANTITIES, lambda quantity: -distance(quantity[2], quantity[3])
+    )
     gap = distance(factor, power)
     if abs(level) < np.log(_MAX_GAIN) or distance(1.0, 0) < gap:
         return
@@ -480,146 +587,12 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
 
 def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
     """Raise InputError for conjugated phases."""
-    match, other = (best_wiring(plate, each, shapes) for each in (values, values.conj()))
-    if other.fit.cost < match.fit.cost - MIN_COST_REDUCTION:
+    match = best_wiring(plate, values, shapes)
+    conjugate = best_wiring(plate, values.conj(), shapes)
+    if conjugate.fit.cost < match.fit.cost - MIN_COST_REDUCTION:
         raise InputError(
             "phases must be for exp(+i omega t), but appear to be conjugated: with the signs of "
             "all imaginary parts changed, the model fits better "
-            f"({100 * other.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
+            f"({100 * conjugate.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
             "change the signs"
         )
-
-
-def verdict_rows(verdict: Verdict) -> list[str]:
-    """Return lines of findings with their remedies, or a line that all is well."""
-    rows = [row for each in verdict.findings for row in each.rows]
-    if verdict.is_well and not verdict.about("sensor"):
-        wiring = "WIRING WELL: every driven channel drives its own ERA"
-        all_well = "ALL WELL: plate and channels match the rig"
-        rows.append(wiring if difference_rows(verdict) else all_well)
-    return rows
-
-
-def difference_rows(verdict: Verdict) -> list[str]:
-    """Line on a plate that keeps too little of the rig's promises; empty if it keeps enough."""
-    kept = verdict.kept_share
-    if verdict.changes is None or kept is None or kept >= MIN_KEPT_SHARE:
-        return []
-    names = {"loss_factor": "loss factor", "stiffness": "ERA stiffness", "damping": "ERA damping"}
-    changes = ", ".join(
-        f"{names.get(kind, kind)} {100 * change:+.0f} %"
-        for kind, change in verdict.changes.items()
-        if abs(change) >= _MIN_CHANGE
-    )
-    within = "within tolerances, but off its nominal values: " if verdict.plate_matches else ""
-    if verdict.about("form"):
-        within, changes = "", "in a way that no parameter describes"
-    return [
-        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; the plate keeps "
-        f"{percent(kept)} of the promises of the rig's table: calibrate it with "
-        "`era calibrate`"
-    ]
-
-
-def channel_table(verdict: Verdict) -> list[str]:
-    """Table of the channels with a header line."""
-    rows = [f"{'ERA':8} {'channel':12} {'drives':8} {'gain':>6} {'phase':>7} {'MAC':>6}  verdict"]
-    for channel in verdict.channels:
-        gain = "-" if channel.gain is None else f"{channel.gain:.2f}"
-        phase = "-" if channel.phase is None else f"{channel.phase:+.0f}°"
-        mac = "-" if channel.mac_found is None else f"{channel.mac_found:.3f}"
-        rows.append(
-            f"{channel.era:8} {f'{channel.amplifier}:{channel.channel}':12} "
-            f"{channel.drives or '-':8} {gain:>6} {phase:>7} {mac:>6}  "
-            f"{', '.join(channel.states)}"
-        )
-    return rows
-
-
-def as_json(verdict: Verdict) -> dict[str, Any]:
-    """Verdict as JSON; units are in the keys."""
-    match, beyond = verdict.match, verdict.about("load", "form")
-    corrections: dict[str, Any] = {
-        "grain": None,
-        "resonance_is": {},
-        "exchanged_sensors": {},
-        "reversed_axes": [],
-    }
-    for each in verdict.about("file"):
-        corrections |= each.json
-    return {
-        "all_well": verdict.is_well,
-        "channels": [
-            {
-                "era": channel.era,
-                "amplifier": channel.amplifier,
-                "channel": channel.channel,
-                "states": list(channel.states),
-                "drives": channel.drives,
-                "gain": channel.gain,
-                "phase_deg": channel.phase,
-                "mac_of_the_rigs_era": channel.mac_own,
-                "mac_of_the_era_found": channel.mac_found,
-                "confidence": channel.confidence,
-            }
-            for channel in verdict.channels
-        ],
-        "swapped": [[each.era for each in cycle] for cycle in cycles(verdict.channels)],
-        "wiring_matches": verdict.wiring_matches,
-        "plate": {
-            "matches": verdict.plate_matches,
-            **corrections,
-            "beyond": {
-                "kind": beyond[0].kind,
-                "thicker_at_end_of_x": None,
-                "thicker_at_end_of_y": None,
-                "farthest": None,
-                "standard_deviations": None,
-                **beyond[0].json,
-                "loads": [load for each in beyond for load in each.json.get("loads", ())],
-            }
-            if beyond
-            else None,
-            "changes": verdict.changes or {},
-            "kept_share": verdict.kept_share,
-            "promise_margins_db": [*verdict.promise_margins],
-            "unexplained": match and match.error,
-            "farthest_standard_deviations": match and match.worst,
-            "parameters": []
-            if match is None
-            else [
-                {
-                    "parameter": parameter.name,
-                    "unit": parameter.unit,
-                    "expected": parameter.of(match.plate.rig),
-                    "found": parameter.of(match.rig),
-                    "standard_deviations": float(z),
-                }
-                for parameter, z in zip(match.plate.rows, match.z, strict=True)
-            ],
-            "explanations": [
-                {
-                    "key": each.key,
-                    "unit": each.unit,
-                    "expected": each.expected,
-                    "found": each.value,
-                    "explains": each.explains,
-                    "likelihood": each.share,
-                    "unexplained": each.match.error,
-                }
-                for each in verdict.hypotheses
-            ],
-        },
-        "bad_sensors": [
-            {
-                "sensor": each.of,
-                "problem": each.rows[0]
-                .removeprefix(f"SENSOR {each.of} ")
-                .removesuffix(": left out"),
-            }
-            for each in verdict.about("sensor")
-        ],
-        "sensor_count": len(verdict.sensors),
-        "drive_frequencies_hz": verdict.frequencies.tolist(),
-        "findings": verdict_rows(verdict),
-    }

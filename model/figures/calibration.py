@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from model.estimate.calibrate import Calibration
+from model.estimate.calibration_result import Calibration
 from model.figures.style import PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT
 
 _ROWS = 2  # of panels, one for each sensor

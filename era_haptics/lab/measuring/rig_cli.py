@@ -213,8 +213,8 @@ def _read_measured_plate(path: Path, rig: "Rig") -> "MeasuredPlate":
 
     Raises InputError for inconsistent responses.
     """
-    from model.estimate.calibrate import check_consistency
     from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured
+    from model.estimate.screening import check_consistency
 
     measurement = measurement_of(read_measured(path), rig)
     screened = check_consistency(rig, measurement)
@@ -386,7 +386,7 @@ def check(
     """
     import time
 
-    from model.estimate import rig_check
+    from model.estimate import check_report
     from model.estimate.rig_check import diagnose, judged_by_promises
 
     rig, observation = _read(measured, rig_file, mesh=mesh)
@@ -403,13 +403,13 @@ def check(
         f"{rig_file}: {sensors}, {frequencies} from {low:g} to {high:g} Hz, {elapsed:.1f} s",
         rig.uncertainty_note,
         "",
-        *rig_check.channel_table(verdict),
+        *check_report.channel_table(verdict),
         "",
-        *rig_check.verdict_rows(verdict),
-        *rig_check.difference_rows(verdict),
+        *check_report.verdict_rows(verdict),
+        *check_report.difference_rows(verdict),
     ]
     report = {
-        **rig_check.as_json(verdict),
+        **check_report.as_json(verdict),
         "exactly_known": [*rig.exactly_known],
         "elapsed_s": elapsed,
     }

@@ -26,9 +26,9 @@ from kit.weekend_boards import FOLDER, measured_board
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.fit import SensedPlate, sensed_plate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
 from model.estimate.measurement import sensors_at
+from model.estimate.sensed_plate import SensedPlate, sensed_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.modes import SpectralMesh

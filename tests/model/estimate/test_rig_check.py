@@ -37,8 +37,8 @@ from kit.weekend_boards import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate import plate_match
-from model.estimate.calibrate import calibrate, check_consistency
-from model.estimate.fit import sensed_plate
+from model.estimate.calibrate import calibrate
+from model.estimate.check_report import as_json, channel_table, verdict_rows
 from model.estimate.measurement import (
     MeasuredPlate,
     Measurement,
@@ -49,14 +49,9 @@ from model.estimate.measurement import (
     write_responses_csv,
     write_responses_uff,
 )
-from model.estimate.rig_check import (
-    as_json,
-    channel_table,
-    check_meaning,
-    diagnose,
-    judged_by_promises,
-    verdict_rows,
-)
+from model.estimate.rig_check import check_meaning, diagnose, judged_by_promises
+from model.estimate.screening import check_consistency
+from model.estimate.sensed_plate import sensed_plate
 from model.fem import Mesh
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig

@@ -17,8 +17,8 @@ from kit.direct_plate import direct_acceleration, direct_responder
 from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.fit import sensed_plate
 from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.sensed_plate import sensed_plate
 from model.estimate.space import space_of
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.finger import Grid

@@ -1,0 +1,533 @@
+"""Result of a calibration: the fitted rig with its gains and uncertainty, and diagnostics.
+
+The rig contains only values that a rig file can express. Its uncertainty covers the rest: errors of
+the fit, and form errors.
+"""
+
+import math
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from itertools import compress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray, Point, rms
+from model.config.document import KeyPath
+from model.estimate.fit import HELD_OUT_FOLDS, Fit, JointPrior, fit
+from model.estimate.forward import MASS_CELLS, jacobian
+from model.estimate.gains import gains_of, row_rms
+from model.estimate.measurement import LEAST_SENSORS, Measurement
+from model.estimate.noise import fit_to_noise
+from model.estimate.parameters import FORM_ERRORS, PARAMETER_KINDS
+from model.estimate.sensed_plate import Parameter, SensedPlate, errors_by_key
+from model.files.csv_file import as_frame
+from model.rig.rig import Rig, Uncertainty
+
+MAX_PREDICTION_ERROR = 0.25
+"""Largest relative error at held-out sensors of an acceptable fit."""
+
+_MIN_UNCERTAINTY = 1e-4  # no fit is exact
+
+# Relative model errors: of all values except the loss factor, and of the loss factor. Unmodeled
+# form errors widen resonances by 0.4 % (RMS over plates without noise).
+_MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
+# Of all cells together, relative to the plate's mass.
+_FOREIGN_MASS = PARAMETER_KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)
+
+_AT_BOUND = 1e-6  # largest distance of x from its bound
+_CLEAR = 3.0  # standard errors of a significant difference
+
+
+@dataclass(frozen=True)
+class HeldOutSensors:
+    """Prediction at sensors held out of the fit.
+
+    Errors are RMS values over responses, relative to the RMS of all sensors at the same frequency
+    and ERA.
+    """
+
+    sensors: tuple[str, ...]
+    before: float
+    """Error of the rig before the fit."""
+    after: float
+    """Error of the fitted rig."""
+    median: float
+    """Median error of the fitted rig."""
+    unexplained: float
+    """Error of the fitted rig that is explained neither by noise nor by sensor tolerances."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rig fitted to a measurement, with diagnostics of the fit and the measurement."""
+
+    fit: Fit[SensedPlate]
+    """Fit to the sensors with a signal, including form errors.
+
+    Form errors are differences that no rig file describes, such as inaccurate cutting.
+    """
+    prior: JointPrior
+    """Prior of the parameters: mean (p,) and covariance (p, p)."""
+    dead_sensors: tuple[str, ...]
+    """Sensors without a signal, left out of the fit."""
+    dead_eras: tuple[str, ...]
+    """ERAs that do not move the plate, left out of the fit."""
+
+    def to_frame(self) -> Any:
+        """Return parameters before and after, units and errors as a pandas DataFrame.
+
+        One row per parameter; requires pandas.
+        """
+        parameters = self.parameters
+        return as_frame(
+            {
+                "parameter": [parameter.name for parameter in parameters],
+                "unit": [parameter.unit for parameter in parameters],
+                "before": [parameter.before for parameter in parameters],
+                "after": [parameter.value for parameter in parameters],
+                "standard_error": [parameter.standard_error for parameter in parameters],
+            }
+        )
+
+    @property
+    def plate(self) -> SensedPlate:
+        """Plate of the original rig, with the sensors of the fit."""
+        return self.fit.model
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the fit predicts held-out sensors; False without held-out sensors."""
+        return self.held_out is not None and self.held_out.after <= MAX_PREDICTION_ERROR
+
+    @cached_property
+    def rig(self) -> Rig:
+        """Calibrated rig with its gains and uncertainty, without form errors."""
+        eras = []
+        frequencies = self.measurement.frequencies.tolist()
+        for era, gains in zip(self._fitted.eras, self._gains.T.tolist(), strict=True):
+            measured = []
+            for frequency, gain in zip(frequencies, gains, strict=True):
+                if abs(gain) > 0:
+                    measured.append((frequency, abs(gain), float(np.angle(gain))))
+            eras.append(replace(era, gains=tuple(measured) or era.gains))
+        return replace(self._fitted, eras=tuple(eras), uncertainty=self._uncertainty)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Fitted values, with errors from the fit, the model and the total mass.
+
+        All fitted values except losses scale with the total mass, which responses cannot determine.
+        """
+        plate = self.plate
+        x = self.fit.x
+        mass_error = math.hypot(_FOREIGN_MASS, *(PARAMETER_KINDS["side"].std / plate.sides))
+        bounds = np.array([plate.space.lower, plate.space.upper])
+        is_at_bound = np.abs(bounds - x).min(axis=0) < _AT_BOUND
+        values = plate.values(x).tolist()
+        errors = plate.errors(x, self.fit.errors).tolist()
+        fitted = []
+        for number, original in enumerate(plate.parameters):
+            index = plate.numbers[number]
+            model_error = math.hypot(_MODEL_ERROR, mass_error)
+            if original.kind == "loss_factor":
+                model_error = self._loss_error
+            parameter = replace(original, value=values[number])
+            if self.fit.searched[index]:
+                error = math.hypot(errors[number], model_error * values[number])
+                at_bound = bool(is_at_bound[index])
+                parameter = replace(parameter, standard_error=error, at_bound=at_bound)
+            fitted.append(parameter)
+        return tuple(fitted)
+
+    @property
+    def moved(self) -> dict[str, tuple[Point, Point]]:
+        """Positions x, y [m] of ERAs that differ significantly from the rig's, and standard
+        errors."""
+        errors = self.plate.space.values(self.fit.errors, "place").reshape(-1, 2).tolist()
+        moved = {}
+        for number, original in enumerate(self.plate.rig.eras):
+            era = self._fitted.eras[number]
+            if (era.x, era.y) != (original.x, original.y):
+                x_error, y_error = errors[number]
+                moved[era.name] = ((era.x, era.y), (x_error, y_error))
+        return moved
+
+    @cached_property
+    def gains_error(self) -> FloatArray:
+        """Standard errors of the rig's gains (f, eras), NaN where not measured."""
+        slopes, noise_variance = self._gain_changes
+        variance = _variances(slopes.real, self.fit.covariance, self.fit.searched)
+        size = np.abs(self.gains_of_fit)
+        fit_error = size * np.sqrt(noise_variance + variance)
+        return np.asarray(np.hypot(fit_error, np.abs(self._gains) - size))
+
+    @property
+    def scales(self) -> dict[str, tuple[float, float]]:
+        """Scale and standard error of sensors whose scale is wrong, or of all sensors on request.
+
+        Scales are relative to the median of the other sensors.
+        """
+        errors = self.plate.space.values(self.fit.errors, "sensor_scale").tolist()
+        pairs = zip(self.sensor_scales.tolist(), errors, strict=True)
+        by_name = zip(self.measurement.names, pairs, strict=True)
+        return dict(compress(by_name, self.is_rescaled))
+
+    @property
+    def outlier_count(self) -> int:
+        """Number of measured values left out of the fit."""
+        return self.value_count - int(self.measurement.known.sum())
+
+    @property
+    def value_count(self) -> int:
+        """Number of measured values."""
+        return int(np.isfinite(self.measurement.values).sum())
+
+    @property
+    def error(self) -> float:
+        """Relative error of the fit with form errors; see `HeldOutSensors`."""
+        return self._relative_error(self.fit.predicted, self.measurement.known)
+
+    @property
+    def chi2(self) -> float:
+        """chi² per degree of freedom; about 1 for a good fit."""
+        return self.fit.chi2
+
+    @property
+    def measurement(self) -> Measurement:
+        """Responses of the sensors with a signal, with the errors of the fit."""
+        return self.fit.measurement
+
+    @property
+    def measured(self) -> ComplexArray:
+        """Measured responses (f, s, eras) [1/s²], divided by the scales of the sensors."""
+        return self.measurement.values / self.sensor_scales[:, None]
+
+    @property
+    def before(self) -> ComplexArray:
+        """Responses of the original rig (f, s, eras) [1/s²]."""
+        gains = np.array([era.gain(self.measurement.frequencies) for era in self.plate.rig.eras]).T
+        return gains[:, None] * self.plate.responses()
+
+    @property
+    def after(self) -> ComplexArray:
+        """Responses of the calibrated rig (f, s, eras) [1/s²]."""
+        return self._gains[:, None] * self._fields
+
+    @cached_property
+    def held_out(self) -> HeldOutSensors | None:
+        """Prediction of the responses of some sensors by a fit without them.
+
+        These sensors have a known scale. The prediction uses the rig as written to its file,
+        without other form errors. None if too few sensors remain for a fit.
+        """
+        hidden = self._hidden_sensors()
+        if hidden is None:
+            return None
+        partial = self._fitted_without(hidden)
+        values = self.measurement.values
+        scales = self.sensor_scales[:, None]
+        predicted = partial.after * scales
+        valid = self.measurement.known & hidden[:, None]
+        size = row_rms(values)
+        errors = (np.abs(predicted - values) / size)[valid]
+        explained = (self._reading_variance(partial._gains) / size**2)[valid]
+        unexplained = np.median(errors**2) - np.median(explained)
+        return HeldOutSensors(
+            sensors=tuple(compress(self.measurement.names, hidden)),
+            before=self._relative_error(
+                self.before * scales, np.isfinite(values) & hidden[:, None]
+            ),
+            after=self._relative_error(predicted, valid),
+            median=float(np.median(errors)),
+            # The median of |z|² is log 2 of its mean.
+            unexplained=math.sqrt(max(unexplained, 0.0) / math.log(2)),
+        )
+
+    def _hidden_sensors(self) -> NDArray[np.bool_] | None:
+        """Return a mask (s,) of evenly spaced sensors to hold out, whose scale is known.
+
+        None if too few sensors remain for a fit.
+        """
+        count = len(self.measurement.names)
+        candidates = np.flatnonzero(~self.is_rescaled | self.is_rescaled.all())
+        hidden_count = max(round(count / HELD_OUT_FOLDS), 1)
+        if count - hidden_count < LEAST_SENSORS or len(candidates) <= hidden_count:
+            return None
+        spaced = np.linspace(0, len(candidates) - 1, hidden_count + 2)[1:-1].round().astype(int)
+        return np.isin(np.arange(count), candidates[spaced])
+
+    def _fitted_without(self, hidden: NDArray[np.bool_]) -> "Calibration":
+        """Fit again without sensors (s,)."""
+        space = self.plate.space
+        searched = self.fit.searched.copy()
+        searched[space.groups["sensor_scale"]] &= ~hidden
+        searched[space.groups["sensor_place"]] &= np.repeat(~hidden, 2)
+        measurement = self.measurement.part(~hidden[:, None])
+        partial = replace(self, fit=replace(self.fit, measurement=measurement))
+        return partial.fitted_again(searched, self.fit.x)
+
+    def _reading_variance(self, gains: ComplexArray) -> FloatArray:
+        """Variance of readings (f, s, eras) due to noise and the tolerances of sensors.
+
+        gains (f, eras): of the prediction.
+        """
+        of_sensors = self.plate.space.of("sensor_scale", "sensor_place")
+        slopes = jacobian(self.plate.at(self.fit.x), of_sensors)[..., of_sensors]
+        variance = (np.abs(gains[:, None, :, None] * slopes) ** 2).sum(axis=-1)
+        return np.asarray(variance + 2 * self.measurement.std**2)
+
+    @property
+    def sensor_scales(self) -> FloatArray:
+        """Scales of all sensors (s,); unknown scales are relative to their median."""
+        scales = 1 + self.plate.space.values(self.fit.x, "sensor_scale")
+        return scales / self._common_scale
+
+    @property
+    def is_rescaled(self) -> NDArray[np.bool_]:
+        """Mask of the sensors whose scale exceeds any tolerance (s,)."""
+        part = self.plate.space.groups["sensor_scale"]
+        return self.prior.covariance.diagonal()[part] > 1
+
+    @property
+    def gains_of_fit(self) -> ComplexArray:
+        """Gains of the fit with form errors (f, eras), NaN where not measured."""
+        return self.fit.gains * self._common_scale
+
+    def fitted_again(self, searched: NDArray[np.bool_], start: FloatArray) -> "Calibration":
+        """Fit the parameters of a mask (p,), starting from values of all parameters (p,)."""
+        result = fit_to_noise(
+            self.plate, self.measurement, searched=searched, start=start, prior=self.prior
+        )
+        return replace(self, fit=result)
+
+    @property
+    def _common_scale(self) -> float:
+        """Median scale if all scales are unknown, because responses cannot separate it from the
+        gains."""
+        if not self.is_rescaled.all():
+            return 1.0
+        return float(np.median(1 + self.plate.space.values(self.fit.x, "sensor_scale")))
+
+    def _relative_error(self, predicted: ComplexArray, valid: NDArray[np.bool_]) -> float:
+        """RMS error at the values of a mask, relative to the RMS of rows; infinite for an empty
+        mask."""
+        if not valid.any():
+            return math.inf
+        values = self.measurement.values
+        errors = np.abs(predicted - values) / row_rms(values)
+        return rms(errors[valid])
+
+    @cached_property
+    def is_clear(self) -> NDArray[np.bool_]:
+        """Mask of the parameters that differ from the rig by several standard errors (p,)."""
+        return np.abs(self.fit.x) > _CLEAR * self.fit.errors
+
+    @cached_property
+    def _plain(self) -> Fit[SensedPlate]:
+        """Fit of the plate without form errors, which a rig file cannot express.
+
+        Form errors count as noise. A form error that resembles another modulus or loss factor, such
+        as a longer side, is absorbed by these. ERAs stay at their significant positions.
+        """
+        space = self.plate.space
+        refitted = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
+        form_errors = space.of(*FORM_ERRORS, "mode_shifts") & ~refitted
+        x = self.fit.x.copy()
+        x[form_errors | (space.of("place") & ~self.is_clear)] = 0.0
+        searched = self.fit.searched & refitted
+        return fit(self.plate, self.measurement, searched=searched, start=x, prior=self.prior)
+
+    @cached_property
+    def _fitted(self) -> Rig:
+        """Rig without form errors, with ERAs at their significant positions and the original
+        gains."""
+        return self.plate.rig_at(self._plain.x, "place")
+
+    @cached_property
+    def _fields(self) -> ComplexArray:
+        """Responses of the rig without form errors and gains (f, s, eras) [1/s²]."""
+        plain = replace(self.plate, form=None, law=None, last_places={})
+        return plain.with_rig(self._fitted).responses()
+
+    @cached_property
+    def _gains(self) -> ComplexArray:
+        """Best-fitting gains for these responses (f, eras), NaN if not measured."""
+        return self._gains_for(self._fields * self.sensor_scales[:, None])
+
+    def _gains_for(self, model: ComplexArray) -> ComplexArray:
+        """Best-fitting gains (f, eras) for responses (f, s, eras), NaN if not measured."""
+        return gains_of(model, self.measurement.values, self.measurement.weight)
+
+    @cached_property
+    def _gain_changes(self) -> tuple[ComplexArray, FloatArray]:
+        """Relative change of the gains per searched parameter (f, eras, q), and their variance due
+        to noise (f, eras)."""
+        fit = self.fit
+        power = (np.abs(self.measurement.weight * fit.predicted) ** 2).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes = fit.gain_slopes / fit.gains[..., None]
+            noise_variance = np.where(power > 0, max(fit.chi2, 1.0) / power, np.nan)
+        # A force factor and the gain are fitted together: only their product moves the plate.
+        space = self.plate.space
+        numbers = np.flatnonzero(fit.searched)
+        for era, number in enumerate(space.indices("force_factor")):
+            slopes[:, era, numbers == number] += space.std[number]
+        return slopes, noise_variance
+
+    @cached_property
+    def _loss_error(self) -> float:
+        """Relative model error of the loss factor, including the effect of all dampers."""
+        plate = self.plate
+        kinds = np.array([parameter.kind for parameter in plate.parameters])
+        values = plate.values(self.fit.x) / plate.space.scale[plate.numbers]
+        size = np.where(values > 0, values, np.inf)
+        covariance = self.fit.covariance[np.ix_(plate.numbers, plate.numbers)]
+        relative = covariance / np.outer(size, size)
+        dampers = (kinds == "damping") & self.fit.searched[plate.numbers]
+        with_loss = relative[dampers][:, kinds == "loss_factor"].sum(axis=1)
+        slopes, *_ = np.linalg.lstsq(relative[np.ix_(dampers, dampers)], with_loss)
+        return math.hypot(_LOSS_ERROR, _MODEL_ERROR * float(slopes.sum()))
+
+    @cached_property
+    def _uncertainty(self) -> Uncertainty:
+        """Uncertainty of the calibrated rig, for its file.
+
+        Excludes the error of the total mass, which scales all values and changes no pattern.
+        Thickness represents the plate's rigidity: 1 % of modulus shifts modes like 0.5 % of
+        thickness. Values that are not identified keep the original uncertainty.
+        """
+        original = self.plate.rig.uncertainty
+        loss = self._kind_error("loss_factor", model_error=self._loss_error)
+        errors = self._field_errors | {
+            "place": self._place_error,
+            "stiffness": self._kind_error("stiffness"),
+            "damping": math.expm1(max(loss, self._kind_error("damping"))),
+        }
+        if any(parameter.foot for parameter in self.parameters):
+            unidentified = math.hypot(original.supports, _MODEL_ERROR)
+            errors["supports"] = self._kind_error("supports", unidentified=unidentified)
+        # An error is rarely known to more than two digits.
+        rounded = {}
+        for key, error in errors.items():
+            if error < math.inf:
+                rounded[key] = float(f"{error:.2g}")
+        if "damping" in rounded:
+            rounded["damping"] += 1
+        if self.parameters[0].is_identified:
+            rounded |= Uncertainty.of_frequency(float(f"{self._modulus_error / 2:.2g}"))
+        return Uncertainty.clipped(**asdict(original) | rounded)
+
+    def _kind_error(
+        self, kind: str, *, model_error: float = _MODEL_ERROR, unidentified: float = math.inf
+    ) -> float:
+        """Relative RMS error of all values of a kind; unidentified: of a value not identified."""
+        # An exciter's coil both damps and drives; the contribution of its suspension hardly shows
+        # alone.
+        exciters = {parameter.era for parameter in self.plate.exciter_parameters}
+        errors = self.plate.errors(self.fit.x, self.fit.errors).tolist()
+        relative = []
+        for parameter, error in zip(self.parameters, errors, strict=True):
+            is_coil = parameter.kind == "damping" and parameter.era in exciters
+            if parameter.kind != kind or is_coil:
+                continue
+            if not parameter.is_identified:
+                relative.append(unidentified)
+            elif parameter.value > 0:
+                relative.append(math.hypot(error / parameter.value, model_error))
+        return rms(relative)
+
+    @property
+    def _modulus_error(self) -> float:
+        """Relative error of the fitted modulus as a value that reproduces the natural frequencies.
+
+        It includes the effect of form errors on these.
+        """
+        x = self._plain.x
+        error = self.plate.errors(x, self._plain.errors)[0]
+        return math.hypot(error / self.plate.values(x)[0], _MODEL_ERROR)
+
+    @property
+    def _field_errors(self) -> dict[str, float]:
+        """Errors of gains and fields by key of `uncertainty`; missing if an ERA has no gain.
+
+        `field` is the part of the fitted fields that the rig cannot express (form errors), and at
+        least the unexplained error at held-out sensors. `gain` and `phase` are the errors of the
+        best gains for such fields, as measured by the sensors; other errors change gains and fields
+        in opposite directions.
+        """
+        slopes, noise_variance = self._gain_changes
+        covariance = self.fit.covariance
+        # Other fitted parameters change gain and field in opposite directions: sensors measure the
+        # product.
+        of_sensors = self.plate.space.of("sensor_scale", "sensor_place") & self.fit.searched
+        slopes = slopes[..., of_sensors[self.fit.searched]]
+        common = np.nanmean(slopes, axis=(0, 1))
+        single = slopes - common
+        magnitude = np.sqrt(noise_variance + _variances(single.real, covariance, of_sensors))
+        phase = np.sqrt(noise_variance + _variances(single.imag, covariance, of_sensors))
+        missing = self._missing_fields
+        valid = np.isfinite(magnitude) & np.isfinite(missing)
+        if not valid.any(axis=0).all():
+            return {}
+        field = rms(missing[valid])
+        if self.held_out:
+            field = max(field, self.held_out.unexplained)
+        # Error of the best gain if the field at n sensors has this error. Except at resonances,
+        # wrong masses and stiffness change a field in phase with it.
+        gain = field / np.sqrt(self.measurement.known.sum(axis=1)[valid])
+        gain_error = rms(np.hypot(gain, magnitude[valid]))
+        phase_error = rms(np.hypot(math.sqrt(0.5) * gain, phase[valid]))
+        return {
+            "gain": max(gain_error, _MIN_UNCERTAINTY),
+            "phase_deg": math.degrees(max(phase_error, _MIN_UNCERTAINTY)),
+            "field": field,
+            "common_gain": math.sqrt(_variances(common.real, covariance, of_sensors)),
+        }
+
+    @property
+    def _missing_fields(self) -> FloatArray:
+        """Part of the fitted responses that the rig cannot express, relative (f, eras).
+
+        ERAs stay at their fitted positions, since a rig states position errors separately.
+        """
+        x = np.where(self.plate.space.of("place"), self.fit.x, self._plain.x)
+        model = self.plate.responses(x)
+        predicted = self.fit.predicted
+        missing = self._gains_for(model)[:, None] * model - predicted
+        valid = self.measurement.known
+        missing_power = np.where(valid, np.abs(missing) ** 2, 0.0).sum(axis=1)
+        power = np.where(valid, np.abs(predicted) ** 2, 0.0).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.sqrt(missing_power / power))
+
+    @property
+    def _place_error(self) -> float:
+        """RMS error of the ERA positions in the rig, per coordinate [m].
+
+        If the fitted position is not significant, the error of the original position counts. If the
+        data determine a position less well than its prior, the original uncertainty counts.
+        """
+        space = self.plate.space
+        kind = PARAMETER_KINDS["place"]
+        ignored = space.values(np.where(self.is_clear, 0.0, self.fit.x), "place")
+        error = space.values(self.fit.errors, "place")
+        total = np.hypot(np.hypot(ignored, error), kind.theory)
+        is_measured = error < math.sqrt(0.5) * kind.std
+        return rms(np.where(is_measured, total, self.plate.rig.uncertainty.place))
+
+
+def _variances(
+    slopes: FloatArray, covariance: FloatArray, searched: NDArray[np.bool_]
+) -> FloatArray:
+    """Return variances (...) of functions of masked parameters (p,), from slopes (..., q)."""
+    selected = covariance[np.ix_(searched, searched)]
+    return np.asarray(((slopes @ selected) * slopes).sum(axis=-1))
+
+
+def calibration_errors(calibration: Calibration) -> dict[KeyPath, float]:
+    """Return standard errors of the values in a rig file, by key path."""
+    parameters = calibration.parameters
+    errors = [parameter.standard_error for parameter in parameters]
+    return errors_by_key(calibration.rig, zip(parameters, errors, strict=True))

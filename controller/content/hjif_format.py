@@ -25,7 +25,7 @@ from controller.content.reading import (
     too_much,
     unknown_keys,
 )
-from controller.content.wav_format import course_of
+from controller.content.wav_format import pattern_of_signal
 from model.arrays import FloatArray
 from model.config.document import KeyPath
 from model.config.fields import Validation
@@ -302,7 +302,7 @@ class _HjifReading:
             waveform = np.interp(sample_times, knots, amplitudes)
         else:
             waveform = _cubic(sample_times, knots, amplitudes)
-        course = course_of(waveform * self._gain, _SAMPLE_RATE)
+        course = pattern_of_signal(waveform * self._gain, _SAMPLE_RATE)
         course_knots = np.unique([time for time, _ in (*course.intensity, *course.sharpness)])
         levels = stretches_between(course.intensity, course_knots)
         sharpness = stretches_between(course.sharpness or ((0.0, 0.0),), course_knots)

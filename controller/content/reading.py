@@ -8,7 +8,8 @@ import json
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
 
@@ -16,7 +17,15 @@ import numpy as np
 from pydantic import ConfigDict, GetCoreSchemaHandler
 
 from controller.content.pattern import MAX_CONTENT_DURATION, Pattern
-from model.config.document import ConfigError, ConfigProblem, Document, KeyPath, decoded, key_name
+from model.config.document import (
+    ConfigError,
+    ConfigProblem,
+    Document,
+    KeyPath,
+    decoded,
+    key_name,
+    parse_document,
+)
 from model.config.fields import Section
 from model.errors import shown
 from model.quantities import counted
@@ -35,11 +44,11 @@ _MAX_QUOTED = 50  # characters in errors
 _MAX_NAMED = 5  # unknown names in a remark
 _MAX_NAME = 40  # characters of a name to compare with valid names
 _EMPTY: tuple[object, ...] = (None, "", [], {})
+_BLANKS = str.maketrans("\t\x85\u2028\u2029", "    ")  # neither tab nor new line in YAML
 
 _STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # or an unterminated one: no text is read twice
 _STRINGS = re.compile(_STRING, re.DOTALL)
 _TRAILING_COMMA = re.compile(rf"({_STRING})|,(?=[ \t\n\r]*[\]}}])", re.DOTALL)
-_TOKENS = re.compile(rf"{_STRING}|[{{}}\[\],:]|[^\s{{}}\[\],:\"]+", re.DOTALL)
 
 _T = TypeVar("_T")
 
@@ -105,7 +114,6 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
     if has_trailing_commas:
         text = _TRAILING_COMMA.sub(lambda match: match[1] or " ", text)
     _check_size(source, text)
-    find_lines = partial(_lines_of, source, text)
     has_repeats = False
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -123,8 +131,9 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
     if not isinstance(data, dict):
         raise refusal(source, "must be an object in braces, got another value", line=1)
     if has_repeats:
-        find_lines()  # raises
-    return Document(source, text, data, find_lines)
+        _as_yaml(source, text)  # raises with the line
+        raise refusal(source, "has a key that is given twice; remove one")
+    return Document(source, text, data, partial(_lines_of, source, text))
 
 
 def _check_size(source: str, text: str) -> None:
@@ -155,37 +164,16 @@ def _why_unparsed(text: str, error: json.JSONDecodeError) -> str:
     return f"is not valid JSON: {error.msg} in column {error.colno}; {remedy}"
 
 
-def _lines_of(source: str, text: str) -> dict[KeyPath, int]:
-    """Return the line of every key and list entry of JSON; raises ConfigError for a repeat."""
-    lines: dict[KeyPath, int] = {}
-    path: list[str | int] = []  # of the next value
-    line = 1
-    position = 0
-    is_key = False
-    for match in _TOKENS.finditer(text):
-        line += text.count("\n", position, match.start())
-        position = match.start()
-        symbol = match[0]
-        if symbol in ("}", "]"):
-            path.pop()
-            is_key = False
-        elif symbol == ",":
-            last = path[-1]
-            is_key = isinstance(last, str)
-            if isinstance(last, int):
-                path[-1] = last + 1
-        elif symbol != ":":
-            if is_key:
-                path[-1] = json.loads(symbol)
-            key = tuple(path)
-            if is_key and key in lines:
-                message = f"is given twice, first on line {lines[key]}; remove one"
-                raise refusal(source, message, line=line, key=key_name(key))
-            lines.setdefault(key, line)
-            is_key = symbol == "{"
-            if symbol in ("{", "["):
-                path.append("" if is_key else 0)
-    return lines
+def _lines_of(source: str, text: str) -> Mapping[KeyPath, int]:
+    """Return the line of every key and list entry of JSON; empty if YAML does not include it."""
+    with suppress(ConfigError):
+        return _as_yaml(source, text).lines
+    return {}
+
+
+def _as_yaml(source: str, text: str) -> Document:
+    """Read JSON as YAML; raises ConfigError for a repeated key."""
+    return parse_document(source, text.translate(_BLANKS), max_values=3 * _MAX_VALUES)
 
 
 def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ out, with a remark in dB.
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,27 +55,11 @@ class Wav(ContentFormat):
             raise refusal(source, f"must have 1 or 2 channels, got {channel_count}")
         if channel > channel_count:
             raise refusal(source, f"channel must be 1 to {channel_count}, got {channel}")
-        course = course_of(samples[:, channel - 1], rate)
-        remarks = course.remarks
+        pattern = pattern_of_signal(samples[:, channel - 1], rate)
         if channel_count == 2:
-            remarks = (f"channel {channel} of 2 read", *remarks)
-        return Pattern(
-            duration,
-            course.intensity,
-            course.sharpness,
-            remarks=remarks,
-            out_of_band_share=course.out_of_band_share,
-        )
-
-
-class SignalCourse(NamedTuple):
-    """A sampled signal as intensity and sharpness over time."""
-
-    intensity: Curve
-    sharpness: Curve
-    out_of_band_share: float
-    """Share of the signal's energy outside the frequencies of sharpness, 0 to 1."""
-    remarks: tuple[str, ...]
+            remarks = (f"channel {channel} of 2 read", *pattern.remarks)
+            return replace(pattern, remarks=remarks)
+        return pattern
 
 
 class _BandCourse(NamedTuple):
@@ -85,8 +70,8 @@ class _BandCourse(NamedTuple):
     """Center frequency."""
 
 
-def course_of(signal: FloatArray, rate: int) -> SignalCourse:
-    """Return intensity and sharpness of a signal at a rate [Hz]."""
+def pattern_of_signal(signal: FloatArray, rate: int) -> Pattern:
+    """Return the pattern of a signal at a rate [Hz]."""
     import scipy.fft
 
     duration = len(signal) / rate
@@ -112,11 +97,12 @@ def course_of(signal: FloatArray, rate: int) -> SignalCourse:
     times[-1] = min(times[-1], duration)
     is_felt = intensity > 0
     out_of_band_share = _out_of_band_share(spectrum, in_band)
-    return SignalCourse(
+    return Pattern(
+        duration,
         _whole_curve(times, intensity, duration),
         thinned_curve(times[is_felt], sharpness[is_felt]),
-        out_of_band_share,
-        tuple(_signal_remarks(out_of_band_share, intensity)),
+        remarks=tuple(_signal_remarks(out_of_band_share, intensity)),
+        out_of_band_share=out_of_band_share,
     )
 
 

@@ -201,13 +201,15 @@ def decoded(source: str, content: bytes) -> str:
         raise ConfigError(source, [ConfigProblem(line, "", message)]) from error
 
 
-def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Document:
+def parse_document(
+    source: str, text: str, *, if_empty: str = IF_EMPTY, max_values: int = MAX_DOCUMENT_VALUES
+) -> Document:
     """Read the text of a YAML file that came from a source; raises ConfigError."""
     if found := _NOT_ALLOWED.search(text):
         line = text.count("\n", 0, found.start()) + 1
         message = f"character U+{ord(found[0]):04X} is not allowed in YAML; remove it"
         raise ConfigError(source, [ConfigProblem(line, "", message)])
-    reader = _PlainReader(source, text)
+    reader = _PlainReader(source, text, max_values)
     try:
         data = reader.document()
     except yaml.MarkedYAMLError as error:
@@ -292,8 +294,9 @@ class _PlainReader:
     lines: of every key and list entry by path; repeated: duplicate keys.
     """
 
-    def __init__(self, source: str, text: str) -> None:
+    def __init__(self, source: str, text: str, max_values: int) -> None:
         self._source, self._text = source, text
+        self._max_values = max_values
         self._events: Iterator[Any] = yaml.parse(text, Loader=YAML_LOADER)
         self.lines: dict[KeyPath, int] = {}
         self.repeated: list[ConfigProblem] = []
@@ -353,8 +356,8 @@ class _PlainReader:
         if len(path) > _MAX_DEPTH:
             raise self._refused(path[:3], event, f"is nested more than {_MAX_DEPTH} levels deep")
         self._count += 1
-        if self._count > MAX_DOCUMENT_VALUES:
-            raise self._refused((), event, f"has more than {MAX_DOCUMENT_VALUES} values")
+        if self._count > self._max_values:
+            raise self._refused((), event, f"has more than {self._max_values} values")
 
     def _refused(self, path: KeyPath, event: Any, message: str) -> ConfigError:
         return ConfigError(self._source, [ConfigProblem(_line(event), key_name(path), message)])

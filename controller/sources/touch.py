@@ -8,9 +8,10 @@ import logging
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from statistics import linear_regression
 from typing import NamedTuple
 from urllib.parse import parse_qsl
 
@@ -219,11 +220,8 @@ class FingerMotion:
         duration = times[-1] - times[0]
         if duration < _MIN_DURATION:
             return 0.0, 0.0
-        mean_time = sum(times) / len(times)
-        deviations = [time - mean_time for time in times]
-        variance = sum(deviation**2 for deviation in deviations)
-        vx = _covariance(deviations, x_values) / variance
-        vy = _covariance(deviations, y_values) / variance
+        vx = linear_regression(times, x_values).slope
+        vy = linear_regression(times, y_values).slope
         is_moving = math.hypot(vx, vy) * duration >= _MIN_DISTANCE
         return (vx, vy) if is_moving else (0.0, 0.0)
 
@@ -231,13 +229,6 @@ class FingerMotion:
     def is_under_way(self) -> bool:
         """Whether it moved at its last report."""
         return len(self.places) > 0 and any(self.velocity(self.places[-1][0]))
-
-
-def _covariance(deviations: Sequence[float], values: Sequence[float]) -> float:
-    """Return the covariance of deviations from a mean with values, times their number."""
-    mean = sum(values) / len(values)
-    pairs = zip(deviations, values, strict=True)
-    return sum(deviation * (value - mean) for deviation, value in pairs)
 
 
 AT_REST = FingerMotion()

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pydantic.json_schema import models_json_schema
+from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from controller.api.jsonrpc import ERROR_MEANINGS, ErrorCode, ErrorData
 from controller.api.methods import METHODS, Method
@@ -47,18 +47,7 @@ class ErrorBody(ApiMessage):
 
 def openapi() -> dict[str, Any]:
     """Return the OpenAPI 3.1 description of the API."""
-    params: set[type[ApiMessage]] = set()
-    results: set[type[ApiMessage]] = {ErrorBody}
-    for method in HTTP_METHODS.values():
-        params.add(method.params)
-        results.add(method.result)
-    references, definitions = models_json_schema(
-        [
-            *((model, "validation") for model in sorted(params, key=repr)),
-            *((model, "serialization") for model in sorted(results, key=repr)),
-        ],
-        ref_template="#/components/schemas/{model}",
-    )
+    references, definitions = _schemas()
     paths = {}
     for name, method in HTTP_METHODS.items():
         paths[f"/api/v1/{name}"] = {"post": _operation(name, method, references)}
@@ -82,12 +71,30 @@ def openapi() -> dict[str, Any]:
     }
 
 
+def _schemas() -> tuple[Any, dict[str, Any]]:
+    """Return references to the schemas of all bodies, by model and mode, and the schemas."""
+    params: set[type[ApiMessage]] = set()
+    results: set[type[ApiMessage]] = {ErrorBody}
+    for method in HTTP_METHODS.values():
+        params.add(method.params)
+        results.add(method.result)
+    models: list[tuple[type[ApiMessage], JsonSchemaMode]] = []
+    for model in sorted(params, key=repr):
+        models.append((model, "validation"))
+    for model in sorted(results, key=repr):
+        models.append((model, "serialization"))
+    template = "#/components/schemas/{model}"
+    return models_json_schema(models, ref_template=template)
+
+
 def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
     """Return the request and responses of a method."""
     errors = dict(_GATEWAY_ERRORS)
     for code, status in HTTP_STATUS.items():
-        meaning = ERROR_MEANINGS[code]
-        errors[status] = f"{errors[status]}; {meaning}" if status in errors else meaning
+        meanings = [ERROR_MEANINGS[code]]
+        if status in errors:
+            meanings.insert(0, errors[status])
+        errors[status] = "; ".join(meanings)
     success = _json_content(references[method.result, "serialization"])
     failure = _json_content(references[ErrorBody, "serialization"])
     responses: dict[str, Any] = {"200": {"description": "done", "content": success}}

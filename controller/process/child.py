@@ -33,13 +33,13 @@ async def ended(process: asyncio.subprocess.Process, timeout: float) -> None:
     await process.wait()
 
 
-def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """Let the kernel signal this process when its parent exits (Linux); exit if it already has.
+def end_with_parent(parent: int) -> None:
+    """Let the kernel terminate this process when its parent exits (Linux); exit if it already has.
 
-    parent: its process number; number: of the signal.
+    parent: its process number.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
         os._exit(0)  # the parent exited before prctl
 

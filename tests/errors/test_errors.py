@@ -204,7 +204,8 @@ def test_command_keeps_previous_output_when_the_disk_is_full(
     with full_disk():
         status, said = outcome_of(command)
     assert status == 2
-    (line,) = (one for one in said.splitlines() if not re.match(r"\d+ of \d+ ", one))  # progress
+    progress = re.compile(r"era: \d+ of \d+ ")
+    (line,) = (line for line in said.splitlines() if not progress.match(line))
     assert line.startswith("era: error: "), said
     assert files(home) == before
 

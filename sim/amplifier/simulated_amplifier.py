@@ -170,7 +170,10 @@ class SimulatedAmplifier:
         self._start()
 
     def _start(self) -> None:
-        """Reset all but the temperature and the fault history."""
+        """Begin without sets, session and watchdog, by the present capabilities.
+
+        State, fault, latch, fault history, temperature and interlock are not changed.
+        """
         self.playback = playback_of(self.capabilities)
         self.session = 0
         self.is_derated = False
@@ -356,13 +359,16 @@ class SimulatedAmplifier:
         """
         self._faults.appendleft(FaultRecord(fault, channel, moment))
         if self.state in (_ENABLED, "SWITCHED_ON", "QUICK_STOP_ACTIVE"):
-            self.silence(moment, ramp=SILENCING_RAMP)
+            self._silence(moment, ramp=SILENCING_RAMP)
             self.fault = fault
             self.latch = token_after(self.latch)
             self._enter("FAULT_REACTION_ACTIVE", moment, channel=channel)
 
     def set_interlock(self, moment: float, *, is_open: bool) -> None:
-        """Open or close the interlock, with its consequences."""
+        """Open or close the interlock.
+
+        Opening it is a fault, except of a disarmed amplifier, which only rejects Arm meanwhile.
+        """
         if is_open and self.state != "SWITCH_ON_DISABLED":
             self.trip("INTERLOCK", moment)
         self._is_interlock_open = is_open
@@ -376,7 +382,10 @@ class SimulatedAmplifier:
             self._handle_overtemperature(moment)
 
     def restart(self, moment: float) -> None:
-        """Power-cycle: immediately silent, disarmed, without sets."""
+        """Power-cycle: immediately silent, disarmed, without sets and without a fault.
+
+        The latch and the fault history are kept.
+        """
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = "NONE"
         self._start()
@@ -401,7 +410,7 @@ class SimulatedAmplifier:
             case "Clear":
                 self._clear(values["latch"], following, now)
             case "Set":
-                return self.take_part(values, now)
+                return self._take_part(values, now)
             case "Commit":
                 self._commit(values, now)
             case "Mark":
@@ -421,7 +430,7 @@ class SimulatedAmplifier:
         if name == "Stop":
             self.latch = token_after(self.latch)
         ramp = min(values["ramp"], self.capabilities["ramp_max"])
-        self.silence(now, ramp=_Q["ramp"].from_wire(ramp))
+        self._silence(now, ramp=_Q["ramp"].from_wire(ramp))
         self._enter(following, now)
         self.tick(now)
 
@@ -430,7 +439,7 @@ class SimulatedAmplifier:
         limit = self.capabilities["ramp_max"]
         if values["ramp"] > limit:
             raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
-        self.silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+        self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
 
     def _steer_clock(self, rate: int, now: float) -> None:
         """Set the rate of the clock, which can change the moment of a waiting set."""
@@ -468,7 +477,7 @@ class SimulatedAmplifier:
         if self.state == _ENABLED:  # repeated, because its reply was lost
             return
         # Arming starts at level zero, even if the last session left a fade.
-        self.silence(now, ramp=SILENCING_RAMP)
+        self._silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
         self.session = values["session"]
         self.clock.shift(values["shift"])
@@ -483,7 +492,7 @@ class SimulatedAmplifier:
             self.fault = "NONE"
             self._enter(following, now)
 
-    def take_part(self, part: Values, now: float) -> Values:
+    def _take_part(self, part: Values, now: float) -> Values:
         """Take the last part of a set, and play the set if it is complete and to play now.
 
         Returns the values of the reply; raises Refusal.
@@ -498,7 +507,7 @@ class SimulatedAmplifier:
             return self._set_reply(token, is_staged=True)
         self._intake.commit(token, now)
         self._start_waiting(now)
-        self.play(taken.layers, token, now)
+        self._play(taken.layers, token, now)
         return self._set_reply(token, is_played=True)
 
     def _set_reply(
@@ -521,16 +530,16 @@ class SimulatedAmplifier:
         if 1 <= (at - high_word(self.clock.reading(now))) % HIGH_WORDS <= AHEAD_MAX:
             self._waiting = _WaitingSet(self.clock.reaches(at, now), commit, layers)
         else:
-            self.play(layers, commit["token"], now)
+            self._play(layers, commit["token"], now)
 
     def _start_waiting(self, moment: float) -> None:
         """Play the set that waits for a moment, if there is one."""
         waiting = self._waiting
         if waiting is not None:
             self._waiting = None
-            self.play(waiting.layers, waiting.commit["token"], moment)
+            self._play(waiting.layers, waiting.commit["token"], moment)
 
-    def play(self, layers: Layers, token: int, now: float) -> None:
+    def _play(self, layers: Layers, token: int, now: float) -> None:
         """Start the layers of a set at a time [s]."""
         allowed_layers = derated(layers, DERATED) if self.is_derated else layers
         self.playback.commit(allowed_layers, token, now)
@@ -541,7 +550,7 @@ class SimulatedAmplifier:
         )
         self._changed(now)
 
-    def silence(self, moment: float, *, ramp: float) -> None:
+    def _silence(self, moment: float, *, ramp: float) -> None:
         """Silence every channel within the ramp [s], and discard staged and waiting sets."""
         self.playback.silence(moment, ramp)
         self.silent_from = max(self.playback.silent_from, moment)

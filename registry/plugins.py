@@ -26,16 +26,19 @@ def did_you_mean(name: str, known: Iterable[str], *, ending: str = "") -> str:
     """
     from difflib import get_close_matches  # not loaded for --help
 
-    by_lower = {each.lower(): each for each in known}
-    close = get_close_matches(name.lower(), by_lower, n=1, cutoff=_NEAR)
-    close = close or [each for each in by_lower if name.lower() in re.split("[-_]", each)]
-    return (
-        f"did you mean {' or '.join(by_lower[each] + ending for each in close)}? " if close else ""
-    )
+    word = name.lower()
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    close = get_close_matches(word, by_lower, n=1, cutoff=_NEAR)
+    if not close:
+        close = [candidate for candidate in by_lower if word in re.split("[-_]", candidate)]
+    if not close:
+        return ""
+    suggestions = [by_lower[candidate] + ending for candidate in close]
+    return f"did you mean {' or '.join(suggestions)}? "
 
 
 _T = TypeVar("_T")
-_Made = TypeVar("_Made")
+_Object = TypeVar("_Object")
 
 EXAMPLE_PREFIX = "example"
 """Prefix of the example plug-ins' names; the project's own names never begin with it."""
@@ -46,7 +49,7 @@ _REMEDY = "repair or remove that package"
 
 @dataclass(frozen=True)
 class PluginRegistry(Generic[_T]):
-    """Objects of one kind by name.
+    """Objects of a kind by name.
 
     what: the kind, for error messages; group: of its entry points; base: what these must be derived
     from, or, if is_instance, be an instance of; error: the class of errors raised; own: the objects
@@ -103,7 +106,7 @@ class PluginRegistry(Generic[_T]):
             return self._loaded(points[0], within)
         return EntryPoint(name, own, self.group).load() if isinstance(own, str) else own
 
-    def make(self: "PluginRegistry[Callable[[str], _Made]]", url: str) -> _Made:
+    def make(self: "PluginRegistry[Callable[[str], _Object]]", url: str) -> _Object:
         """Call the class named by the scheme of a URL with the URL; raises like `find`.
 
         The class may raise `error` for a URL that it refuses. Schemes are case-insensitive.
@@ -205,28 +208,29 @@ def _quoted(within: str) -> str:
 
 def plugins_of(group: str) -> dict[str, tuple[EntryPoint, ...]]:
     """Return the entry points of a group by name, on the current path: a notebook may add to it."""
-    return _found(group, tuple(sys.path))
+    return _entry_points(group, tuple(sys.path))
 
 
 @cache
-def _found(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...]]:
+def _entry_points(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...]]:
     """Equal entry points count once: an installation may be on the path twice."""
-    found: dict[str, dict[str, EntryPoint]] = {}
+    by_name: dict[str, dict[str, EntryPoint]] = {}
     for point in entry_points(group=group):
-        found.setdefault(point.name, {}).setdefault(point.value, point)
-    return {name: tuple(points.values()) for name, points in found.items()}
+        by_name.setdefault(point.name, {}).setdefault(point.value, point)
+    return {name: tuple(points.values()) for name, points in by_name.items()}
 
 
 @cache
 def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
     """Return one plug-in per other package, by top-level module."""
-    points = [
-        point
-        for group in entry_points().groups
-        if group.startswith(_GROUP_PREFIX)
-        for point in entry_points(group=group)
-    ]
-    return {point.module.partition(".")[0]: point for point in points if _package(point) != _OURS}
+    by_module: dict[str, EntryPoint] = {}
+    for group in entry_points().groups:
+        if not group.startswith(_GROUP_PREFIX):
+            continue
+        for point in entry_points(group=group):
+            if _package(point) != _OURS:
+                by_module[point.module.partition(".")[0]] = point
+    return by_module
 
 
 def _package(point: EntryPoint) -> str:

@@ -2,8 +2,8 @@
 
 Modulation is a carrier with two side bands. At full modulation each side band has half the
 carrier's amplitude. With the carrier's weights, side bands would leak 3 to 12 dB more, so each side
-band has separate weights, computed like those of a content at its frequency. The carrier is chosen
-for all three together, near the best steady one.
+band has separate weights, computed as for a content at its frequency. The carrier is chosen for all
+three together, near the best steady one.
 """
 
 import math
@@ -251,7 +251,8 @@ def as_quiet_fingers_allow(table: LocalizationTable, result: Answer) -> Answer:
 
 
 def _loudest_db_sl(foreign_db_sl: Sequence[Sequence[float]], fingers: Sequence[int]) -> float:
-    """Return the highest foreign level at fingers, by the rig's own thresholds; -inf for none."""
+    """Return the highest foreign level at fingers, relative to the rig's own thresholds; else
+    -inf."""
     return max([foreign_db_sl[finger][0] for finger in fingers], default=-math.inf)
 
 

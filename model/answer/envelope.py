@@ -1,4 +1,4 @@
-"""Envelopes of a stimulus and of its drive: pulses, courses, ramps, and what is felt over them.
+"""Envelopes of stimuli and drives: pulses, courses and ramps, and their effect at fingers.
 
 The plate follows its drive late: over 40 ms, the RMS at a finger is several decibels below that of
 the steady vibration, ten decibels on a sharp resonance, and the plate rings after the end.
@@ -229,7 +229,7 @@ class DriveEnvelope:
         """Return the sensation of k fingers from squared amplitudes relative to the threshold (n +
         1, k, p).
 
-        The last square is that of the steady vibration; weights (k, p): of the points in the mean
+        The last square belongs to the steady vibration; weights (k, p): of the points in the mean
         over a fingertip.
         """
         power = self.share * self.moments(squares[:-1]) + (1 - self.share) * squares[-1]

@@ -1,6 +1,6 @@
 """Pack a question for the C kernel, and read its tones.
 
-The question and the answer are those of the numpy reference (`model.answer.question`).
+The numpy reference has the same question and result (`model.answer.question`).
 """
 
 from array import array
@@ -139,7 +139,7 @@ def ask_kernel(library: Kernels, table: LocalizationTable, contents: Contents) -
     if contents.loads.count(1.0) < len(contents.loads):
         loads = _FingerLoads.of(table, finger_count, contents.loads)
 
-    # The arrays live until the kernel has returned. Those of the standard library are faster to
+    # The arrays live until the kernel has returned. Arrays of the standard library are faster to
     # build and to read here than numpy's.
     numbers = _packed_numbers(contents)
     levels = array("f", [10 ** (stream.level_db_sl / 20) for stream in streams])

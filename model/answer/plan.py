@@ -356,7 +356,7 @@ class _Search:
     def _finger_pairs(
         self, group: Sequence[int], other_group: Sequence[int]
     ) -> list[tuple[Finger, Finger]]:
-        """Return all pairs of a finger of one group and one of the other."""
+        """Return all pairs of fingers from two groups."""
         fingers = self.fingers
         return [(fingers[a], fingers[b]) for a in group for b in other_group]
 

@@ -232,9 +232,9 @@ class _ContentSearch:
     def results(
         self, places: IntArray, groups: Sequence[NDArray[np.bool_]]
     ) -> Iterator[_SearchResult]:
-        """Search with each group of ERAs, by the mean over other fingers and by their points.
+        """Search with each group of ERAs, for the mean over quiet fingers and for their points.
 
-        If any group reaches the level, the others do not count.
+        If any group reaches the level, only groups that reach it count.
         """
         forms = _forms_at(places, self.steady, self.ringing)
         by_group = list[tuple[Forms, _SearchResult]]()
@@ -253,7 +253,7 @@ class _ContentSearch:
                 yield self._by_point(by_mean, searched_forms)
 
     def _by_point(self, by_mean: _SearchResult, searched_forms: Forms) -> _SearchResult:
-        """Search by the points of other fingers, for the level of a search by their means."""
+        """Search for the points of quiet fingers, at the level that the search for means used."""
         places = by_mean.places
         if self.ringing is not None:
             best = best_first(by_mean.result.score)[:MAX_BY_POINT]

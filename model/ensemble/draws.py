@@ -98,8 +98,9 @@ def draw(
     # Numbers for feet come last, so that they leave all others unchanged.
     numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n + to_feet, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
+    counts = [3 + n + k, n, n, k, k, 1, n, n]
     parameters, sizes, phases, real, imaginary, common, harmonics, quadrature, feet = np.split(
-        numbers, np.cumsum([3 + n + k, n, n, k, k, 1, n, n])
+        numbers, np.cumsum(counts)
     )
     common = np.where(common > np.median(common), COMMON, -COMMON)
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
@@ -151,9 +152,10 @@ def over_fingertips(
 def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
     """Return a percentile over the last axis, linear between values."""
     ordered = np.sort(values, axis=-1)
-    place = percent / 100 * (ordered.shape[-1] - 1)
+    last = ordered.shape[-1] - 1
+    place = percent / 100 * last
     low = int(place)
-    high = min(low + 1, ordered.shape[-1] - 1)
+    high = min(low + 1, last)
     return np.asarray(ordered[..., low] + (place - low) * (ordered[..., high] - ordered[..., low]))
 
 
@@ -194,10 +196,11 @@ class ClockErrors:
                     f"error of the clock of amplifier {name} must be given in s and not negative, "
                     f"got {errors.get(name)}"
                 )
-        found = tuple(float(errors[name]) for name in names)
-        if len(names) < 2 or not any(found):
+        delays = tuple([float(errors[name]) for name in names])
+        if len(names) < 2 or not any(delays):
             return EXACT_CLOCKS
-        return cls(tuple(names.index(wiring[era].amplifier) for era in eras), found)
+        amplifiers = [names.index(wiring[era].amplifier) for era in eras]
+        return cls(tuple(amplifiers), delays)
 
     @property
     def groups(self) -> tuple[int, ...]:
@@ -208,35 +211,33 @@ class ClockErrors:
         alone = [number for number, each in enumerate(self.errors) if each > MAX_HELD]
         if not alone:
             return ()
-        held = [number for number in range(len(self.errors)) if number not in alone]
-        order = [held, *([each] for each in alone)] if held else [[each] for each in alone]
-        return tuple(
-            next(number for number, group in enumerate(order) if amplifier in group)
-            for amplifier in self.amplifier
-        )
+        has_synchronized = len(alone) < len(self.errors)
+        group_of_amplifier = dict.fromkeys(range(len(self.errors)), 0)
+        for group, number in enumerate(alone, start=int(has_synchronized)):
+            group_of_amplifier[number] = group
+        return tuple([group_of_amplifier[number] for number in self.amplifier])
 
     def power_shares(self, frequencies: FloatArray) -> Float32Array | None:
-        """Share (f, n, n) by which delays increase the modeled power of pairs of ERAs; None if
-        exact.
+        """Relative increase (f, n, n) of the modeled power of pairs of ERAs due to delays.
 
-        Relative to the mean over the delays: exp(p²) - 1 for ERAs of one amplifier, with p = 2 pi f
-        times its error, and 0 for others.
+        None if all clocks are exact. Relative to the mean over the delays: exp(p²) - 1 for ERAs of
+        one amplifier, with p = 2 pi f times its error, and 0 for others.
         """
         if not self.errors:
             return None
-        own = np.array(self.amplifier)
-        phases = 2 * math.pi * np.multiply.outer(frequencies, self._known)
-        variance = phases[:, own] ** 2
-        is_same = own[:, None] == own
+        amplifiers = np.array(self.amplifier)
+        phases = 2 * math.pi * np.multiply.outer(frequencies, self._delay_stds)
+        variance = phases[:, amplifiers] ** 2
+        is_same = amplifiers[:, None] == amplifiers
         grown = np.expm1(np.minimum(variance, _MAX_VARIANCE))[:, :, None] * is_same
         return np.asarray(grown, dtype=np.float32)
 
     def delays(self, by: Drawing) -> FloatArray:
         """Delay of each amplifier on drawn plates, (amplifiers, d) [s]."""
-        return self._known[:, None] * _numbers(by.seed, len(self.errors), by.count)
+        return self._delay_stds[:, None] * _numbers(by.seed, len(self.errors), by.count)
 
     @property
-    def _known(self) -> FloatArray:
+    def _delay_stds(self) -> FloatArray:
         return np.minimum(self.errors, _AS_GOOD_AS_UNKNOWN)
 
 
@@ -258,7 +259,8 @@ def delayed(
     omega (f,) [rad/s]. Of the a attachments and fingers the ERAs come first.
     """
     factors = np.exp(-1j * omega[:, None, None] * clocks.delays(by))
-    found = np.repeat(gains[None], len(omega), axis=0)
+    delayed_gains = np.repeat(gains[None], len(omega), axis=0)
     own = [*clocks.amplifier]
-    found[:, : len(own)] = (1 + gains[: len(own)]) * factors[:, own] - 1
-    return found
+    era_count = len(own)
+    delayed_gains[:, :era_count] = (1 + gains[:era_count]) * factors[:, own] - 1
+    return delayed_gains

@@ -92,11 +92,11 @@ class DrawnPlates:
     thickness_count: int
     """Number of thicknesses of the draws."""
     first_thickness: int
-    """Index of the first of them."""
+    """Index of the draws' first thickness."""
     base_count: int
     """Number of thicknesses at which changes are computed."""
     first_base: int
-    """Index of the first of these."""
+    """Index of the first thickness at which changes are computed."""
 
     @classmethod
     def of(cls, plate_on_eras: PlateOnEras, finger_count: int, drawing: Drawing) -> "DrawnPlates":

@@ -149,7 +149,7 @@ class FiniteElementModes:
         self.losses = np.zeros(kept)
         self.dispersion: Dispersion | None = None
         self.largest_truncated = 1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift)
-        self._known: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
+        self._cache: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -157,12 +157,13 @@ class FiniteElementModes:
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2)."""
-        own, other = self._residuals(points), self._residuals(others)
-        heavy = np.array([self._matrices.mass @ each.T for each in other])
-        terms = np.empty((2 * RESIDUAL_ORDER, own.shape[1], other.shape[1]))
-        terms[0] = self._matrices.deflection_at(points) @ other[0].T
+        residuals = self._residuals(points)
+        other_residuals = self._residuals(others)
+        forces = np.array([self._matrices.mass @ term.T for term in other_residuals])
+        terms = np.empty((2 * RESIDUAL_ORDER, residuals.shape[1], other_residuals.shape[1]))
+        terms[0] = self._matrices.deflection_at(points) @ other_residuals[0].T
         for power in range(2, 2 * RESIDUAL_ORDER + 1):
-            terms[power - 1] = own[power // 2 - 1] @ heavy[(power + 1) // 2 - 1]
+            terms[power - 1] = residuals[power // 2 - 1] @ forces[(power + 1) // 2 - 1]
         return terms
 
     def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
@@ -179,23 +180,24 @@ class FiniteElementModes:
         """Residual vectors of forces at points or footprints, (RESIDUAL_ORDER, n, dof)."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
-        known = self._known.get(key)
-        if known is None:
+        residuals = self._cache.get(key)
+        if residuals is None:
             force = self._matrices.deflection_at(points).T.toarray()
-            mass, vectors = self._matrices.mass, self._vectors
-            known = np.empty((RESIDUAL_ORDER, *force.T.shape))
-            for term in known:
+            mass = self._matrices.mass
+            vectors = self._vectors
+            residuals = np.empty((RESIDUAL_ORDER, *force.T.shape))
+            for term in residuals:
                 # Modes that are kept would outweigh the others a million times in the solution.
                 force -= mass @ (vectors @ (vectors.T @ force))
-                found = self._factor.solve(force)
-                found -= vectors @ (vectors.T @ (mass @ found))
-                term[:] = found.T / self.largest_truncated
+                displacement = self._factor.solve(force)
+                displacement -= vectors @ (vectors.T @ (mass @ displacement))
+                term[:] = displacement.T / self.largest_truncated
                 force = mass @ term.T
-            if known.nbytes <= _MAX_KEPT_BYTES:
-                self._known[key] = known
-                if len(self._known) > _MAX_CACHED:
-                    self._known.pop(next(iter(self._known)))
-        return known
+            if residuals.nbytes <= _MAX_KEPT_BYTES:
+                self._cache[key] = residuals
+                if len(self._cache) > _MAX_CACHED:
+                    self._cache.pop(next(iter(self._cache)))
+        return residuals
 
 
 def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
@@ -205,8 +207,9 @@ def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
     modes[:, 0, 0] = 1
     modes[:, 0, 1:] = nodes - [plate.length / 2, plate.width / 2]
     modes[:, 1, 1] = modes[:, 2, 2] = 1
-    found = modes.reshape(matrices.mesh.dof, RIGID_BODY_MODES)
-    return np.asarray(found / np.sqrt((found * (matrices.mass @ found)).sum(axis=0)))
+    vectors = modes.reshape(matrices.mesh.dof, RIGID_BODY_MODES)
+    modal_masses = (vectors * (matrices.mass @ vectors)).sum(axis=0)
+    return np.asarray(vectors / np.sqrt(modal_masses))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +243,7 @@ class SpectralModes:
         spectral = SpectralPlate(plate, (mesh.nx, mesh.ny), band.middle)
         cut = (2 * math.pi * cutoff_frequency) ** 2
         self._classes = classes = tuple(
-            spectral.modes(each, shift=shift, cut=cut, band=band) for each in CLASSES
+            spectral.modes(parity, shift=shift, cut=cut, band=band) for parity in CLASSES
         )
         # The homogeneous plate that yields under a force in waves that the mesh does not resolve.
         shortest = 2 * math.pi / mesh.shortest_wavelength
@@ -254,7 +257,7 @@ class SpectralModes:
         # u / u_c of each truncated mode to the powers 1, 2, ...
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         # By shape and content; other points can share either one.
-        self._known: dict[tuple[tuple[int, ...], bytes], _PointShapes] = {}
+        self._cache: dict[tuple[tuple[int, ...], bytes], _PointShapes] = {}
         self._is_softer = False
 
     def alternatives(self) -> list["SpectralModes"]:
@@ -269,30 +272,38 @@ class SpectralModes:
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2)."""
-        own, other = self._observe(points), self._observe(others)
-        terms = (own.truncated * self._powers[:, None]) @ other.truncated.T
-        terms[0] += self._local(own, other)
+        shapes = self._observe(points)
+        other_shapes = self._observe(others)
+        terms = (shapes.truncated * self._powers[:, None]) @ other_shapes.truncated.T
+        terms[0] += self._local(shapes, other_shapes)
         return np.asarray(terms)
 
     def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
-        own, at = self._observe(points), self._observe(others)
-        extra = self._residuals(own) @ at.truncated.T
-        extra[: len(own.shapes)] += self._local(own, at)
-        return np.hstack([at.shapes, extra.T])
+        shapes = self._observe(points)
+        other_shapes = self._observe(others)
+        residuals = self._residuals(shapes) @ other_shapes.truncated.T
+        residuals[: len(shapes.shapes)] += self._local(shapes, other_shapes)
+        return np.hstack([other_shapes.shapes, residuals.T])
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` by symmetry class, without the local compliance."""
-        count, mode, rest, found = len(self.eigenvalues), 0, 0, []
+        count = len(self.eigenvalues)
         residuals = self._residuals(self._observe(points))
+        first_mode = 0
+        first_truncated = 0
+        columns = list[FloatArray]()
         for part in self._classes:
-            modes, rests = len(part.eigenvalues), len(part.truncated)
-            own = np.zeros((len(part.shapes), count + len(residuals)))
-            own[:, mode : mode + modes] = part.shapes[:, :modes]
-            own[:, count:] = part.shapes[:, modes:] @ residuals[:, rest : rest + rests].T
-            found.append(own)
-            mode, rest = mode + modes, rest + rests
-        return tuple(found)
+            mode_count = len(part.eigenvalues)
+            modes = slice(first_mode, first_mode + mode_count)
+            truncated = slice(first_truncated, first_truncated + len(part.truncated))
+            of_class = np.zeros((len(part.shapes), count + len(residuals)))
+            of_class[:, modes] = part.shapes[:, :mode_count]
+            of_class[:, count:] = part.shapes[:, mode_count:] @ residuals[:, truncated].T
+            columns.append(of_class)
+            first_mode = modes.stop
+            first_truncated = truncated.stop
+        return tuple(columns)
 
     def _residuals(self, at: _PointShapes) -> FloatArray:
         """Residual vectors in truncated modes, term by term, (RESIDUAL_ORDER n, t)."""
@@ -310,24 +321,29 @@ class SpectralModes:
         """Return the cached shapes at points or footprints on the plate."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
-        if key not in self._known:
+        if key not in self._cache:
             check_footprints_on_plate(points, length=self._mesh.length, width=self._mesh.width)
-            if len(self._known) >= _MAX_CACHED:
-                self._known.pop(next(iter(self._known)))
+            if len(self._cache) >= _MAX_CACHED:
+                self._cache.pop(next(iter(self._cache)))
             degrees = (self._mesh.nx, self._mesh.ny)
             bases = deflections_by_class((self._plate.length, self._plate.width), degrees, points)
-            found = [
-                np.split(own @ part.shapes, [len(part.eigenvalues)], axis=1)
-                for own, part in zip(bases, self._classes, strict=True)
-            ]
-            shapes, truncated = (np.hstack(each) for each in zip(*found, strict=True))
-            unresolved = unresolved_at(self._local_plate, degrees, points)
-            self._known[key] = _PointShapes(shapes, truncated, unresolved)
-        return self._known[key]
+            shapes = list[FloatArray]()
+            truncated = list[FloatArray]()
+            for basis, part in zip(bases, self._classes, strict=True):
+                class_shapes = basis @ part.shapes
+                mode_count = len(part.eigenvalues)
+                shapes.append(class_shapes[:, :mode_count])
+                truncated.append(class_shapes[:, mode_count:])
+            self._cache[key] = _PointShapes(
+                shapes=np.hstack(shapes),
+                truncated=np.hstack(truncated),
+                unresolved=unresolved_at(self._local_plate, degrees, points),
+            )
+        return self._cache[key]
 
 
 FreeModes: TypeAlias = SpectralModes | FiniteElementModes | SurfaceModes
-"""Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.
+"""Modes phi of a free plate up to a cut-off, and the sums over all truncated modes.
 
 A truncated mode with eigenvalue lambda is represented by u = 1 / (lambda + shift), in units of
 largest_truncated, u_c, the value of the lowest one [s²/rad²]. eigenvalues omega² (r,) [rad²/s²],
@@ -361,10 +377,11 @@ def _between(modes: FreeModes, points: FloatArray, others: FloatArray) -> FloatA
 
 def combined(functions: ComplexArray, products: FloatArray) -> ComplexArray:
     """Sum over r of complex functions (..., r) times real products (r, ...), (..., ...)."""
-    flat, rows = functions.reshape(-1, len(products)), products.reshape(len(products), -1)
-    found = np.empty((len(flat), rows.shape[1]), dtype=complex)
-    found.real, found.imag = np.split(np.concatenate([flat.real, flat.imag]) @ rows, 2)
-    return found.reshape(*functions.shape[:-1], *products.shape[1:])
+    flat = functions.reshape(-1, len(products))
+    rows = products.reshape(len(products), -1)
+    sums = np.empty((len(flat), rows.shape[1]), dtype=complex)
+    sums.real, sums.imag = np.split(np.concatenate([flat.real, flat.imag]) @ rows, 2)
+    return sums.reshape(*functions.shape[:-1], *products.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)

@@ -283,7 +283,7 @@ class _Space:
     ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
         """Return deflections, displacements along the plate, and flows of three plates' modes.
 
-        One mode a column; also the number of modes of one plate.
+        Each column is a mode. Also returns how many modes each plate has.
         """
         band = self._band
         deflections = list[FloatArray]()
@@ -356,7 +356,7 @@ class _Space:
 # How far below its degree a polynomial resolves, against 1/2 for a string of free ends: fitted to
 # the compliance of polynomials of degree 72 at 40 places of the paper's plate, within 10 %.
 _UNRESOLVED = 0.9
-_CURVATURE = 1  # how far below it the wave of what is missing is
+_CURVATURE = 1  # the missing compliance oscillates as a polynomial this many degrees lower
 
 _CORNER = 4.0  # bending at a corner, times the infinite plate's
 _TO_CENTROID = 0.5  # where a disc that is cut by an edge acts, between its center and its centroid
@@ -455,7 +455,7 @@ def uncertain_compliance(
 ) -> FloatArray:
     """Return the possible error of the unresolved compliance [m/N] (n, m).
 
-    A fraction of it, plus, for a point (unlimited in shear), ten times shorter waves.
+    A fraction of the compliance. For a point (unlimited in shear), ten times shorter waves as well.
     """
     same = (own.footprints[:, None] == other.footprints).all(axis=2)
     points = same & (own.footprints[:, 2] == 0)[:, None]

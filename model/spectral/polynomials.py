@@ -316,6 +316,7 @@ def class_stiffness(
     u_x, u_y = functions.of_x
     v_x, v_y = functions.of_y
     stretch = np.real(section.stretch)
+    across = np.real(section.across)
     twist = np.real(section.twist)
     slip = np.real(section.slip)
     lever = np.real(section.lever)[:, None]
@@ -329,7 +330,8 @@ def class_stiffness(
     ) -> FloatArray:
         """One part of the energy; powers of s of both sides in it."""
         factor = 1 if by_side is None else -powers[by_side]
-        return _product(factor * matrix, _product(along_x, along_y))
+        products = _product(along_x, along_y)
+        return _product(factor * matrix, products)
 
     K = np.zeros((functions.size, functions.size))
     w_slopes_x = x.slope_squares[x_parity][:w_x, :w_x]
@@ -345,9 +347,7 @@ def class_stiffness(
     K[v, v] += part(twist, x.slope_squares[x_parity], np.eye(v_y), 2, 2)
     K[v, v] += part(slip[1], np.eye(v_x), np.eye(v_y), 0, 2)
 
-    K[u, v] = part(
-        np.real(section.across), x.slope_products[-x_parity], y.slope_products[-y_parity].T, 2, 2
-    )
+    K[u, v] = part(across, x.slope_products[-x_parity], y.slope_products[-y_parity].T, 2, 2)
     K[u, v] += part(twist, x.slope_products[x_parity].T, y.slope_products[y_parity], 2, 2)
     K[w, u] = part(lever[0], x.slope_products[x_parity][:w_x], np.eye(w_y, u_y), 2, 0)
     K[w, v] = part(lever[1], np.eye(w_x, v_x), y.slope_products[y_parity][:w_y], 0, 2)

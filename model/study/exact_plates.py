@@ -89,7 +89,7 @@ def draw_plates(
     (mode_rng,) = rng.spawn(1)
     mode_draws = mode_rng.standard_normal((count, 2, mode_count))
 
-    # The order of these draws is part of what a seed means.
+    # The draws of a seed depend on their order.
     deviation = complex_normal(contact_count)
     common_gain = np.exp(uncertainty.common_gain * normal(1))
     thickness = 1 + uncertainty.thickness * normal()
@@ -126,7 +126,8 @@ def felt_on(
     """
     rows, power = powers_on(table, placed, excitation, plates)
     thresholds = table.thresholds[rows, None, None].astype(float)
-    sensed_power = (power / thresholds**2).sum(axis=0)
+    relative_power = power / thresholds**2
+    sensed_power = relative_power.sum(axis=0)
     sensed_power += harmonics_on(table, placed, excitation, plates)
     weights = read_fingertips(table, placed.contacts).fine_weights
     (means,), (loudest,) = over_fingertips(sensed_power[None], weights)
@@ -203,7 +204,8 @@ def _responses(
         table, discs, fingers, table.attached, rows, bases[:, None], plates
     )[:, :, 0]
     drive_levels = np.abs(bases) / table.highest_drives[rows]
-    field_errors = np.sqrt((table.field_error_power[rows] * drive_levels**2).sum(axis=1))
+    error_power = table.field_error_power[rows] * drive_levels**2
+    field_errors = np.sqrt(error_power.sum(axis=1))
     deviations = np.repeat(plates.deviation, discs.shape[1], axis=1)
     errors = np.multiply.outer(deviations, field_errors).swapaxes(1, 2)
     return rows, (accelerations + errors).transpose(1, 2, 0)
@@ -227,19 +229,21 @@ def accelerations_on(
     check_scales(table.plate, plates.thickness, plates.modulus)
     omega = attached.omega[rows]
     era_stiffness, era_forces = _stiffness_of_eras(table, omega, plates)
-    stiffness = np.concatenate(
-        [era_stiffness, _stiffness_at_rest(table, fingers, omega, plates)], axis=-1
-    )
+    stiffness_at_rest = _stiffness_at_rest(table, fingers, omega, plates)
+    stiffness = np.concatenate([era_stiffness, stiffness_at_rest], axis=-1)
     modal = _modal_receptance(attached.modal[rows], omega, plates)
-    shapes = _attachment_shapes(table, discs[: len(fingers), 0], plates.places)[:, None]
+    finger_shapes = discs[: len(fingers), 0]
+    shapes = _attachment_shapes(table, finger_shapes, plates.places)[:, None]
     receptance = np.asarray((modal * shapes) @ shapes.swapaxes(2, 3), dtype=complex)
     gains = np.array([era.gain(table.frequencies[rows]) for era in table.eras]).T
-    driven = (era_forces * plates.gain[:, None] * gains)[:, :, None] * bases
+    driven_forces = era_forces * plates.gain[:, None] * gains
+    driven = driven_forces[:, :, None] * bases
     undriven_count = shapes.shape[2] - len(table.eras)
     applied = np.pad(driven, ((0, 0), (0, 0), (0, 0), (0, undriven_count)))
     forces = coupled_forces(receptance, stiffness, applied.swapaxes(2, 3))
     modal_displacements = modal * (forces.swapaxes(2, 3) @ shapes)
-    displacements = modal_displacements @ discs.reshape(-1, discs.shape[-1]).T
+    point_shapes = discs.reshape(-1, discs.shape[-1])
+    displacements = modal_displacements @ point_shapes.T
     return -(omega**2)[:, None, None] * displacements
 
 
@@ -275,10 +279,12 @@ def _stiffness_at_rest(
 def _modal_receptance(nominal: ComplexArray, omega: FloatArray, plates: Plates) -> ComplexArray:
     """Return the receptance of each mode (d, m, 1, r) from nominal modal stiffness (m, r)."""
     lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
-    lowest = lowest_elastic(nominal[0].real, plates.modes.shape[2])
-    mode_factors = np.ones((len(plates.modes), 2, nominal.shape[1]))
+    plate_count, _, drawn_count = plates.modes.shape
+    lowest = lowest_elastic(nominal[0].real, drawn_count)
+    mode_factors = np.ones((plate_count, 2, nominal.shape[1]))
     mode_factors[:, :, lowest] = plates.modes[:, :, : len(lowest)]
-    eigenvalue_factors, size_factors = mode_factors[:, :1], mode_factors[:, None, 1:]
+    eigenvalue_factors = mode_factors[:, :1]
+    size_factors = mode_factors[:, None, 1:]
     stiffness = plates.modulus[:, None, None] * eigenvalue_factors * lossy
     receptance = modal_receptance(np.asarray(stiffness, dtype=complex), omega, plates.thickness)
     return receptance[:, :, None] * size_factors
@@ -293,7 +299,8 @@ def _attachment_shapes(
     footprints = footprints_of(table.eras)
     displaced = np.repeat(footprints[None], len(displacements), axis=0)
     sides = np.array([table.plate.length, table.plate.width])
-    displaced[:, :, :2] = np.clip(displaced[:, :, :2] + displacements, 0.0, sides)
+    positions = displaced[:, :, :2] + displacements
+    displaced[:, :, :2] = np.clip(positions, 0.0, sides)
     displaced_shapes = table.shapes_at(displaced.reshape(-1, footprints.shape[1]))
     plate_count, era_count = displaced.shape[:2]
     displaced_shapes = displaced_shapes.reshape(plate_count, era_count, -1)

@@ -6,7 +6,7 @@ that jump at different times, so it moves a magnet no further than a drive that 
 full level are computed for that (`MagnetMotions`). Levels that come and go are followed step by
 step (`Swing`): at the rate of the beat, 10 to 60 times a second, they pump the magnets' free
 vibration, since a side band is at their resonance. The eigenvectors near the drive are followed
-exactly, for straight lines between steps; those far above follow the level at once. Shaped
+exactly, for straight lines between steps; those far above follow the level immediately. Shaped
 envelopes rise above their final amplitude; their difference from a plain ramp is scaled to what the
 magnets allow.
 

@@ -114,19 +114,21 @@ def solve_carrier(
 
 
 def onset_by_numpy(
-    amplitudes: ComplexArray, found: FingerResponses, gain_variance: float
+    amplitudes: ComplexArray, responses: FingerResponses, gain_variance: float
 ) -> ComplexArray:
     """Find the knots (free, eras) of an onset in strokes, all but the last.
 
-    The last are the amplitudes (eras,). found: responses to these ERAs.
+    The last are the amplitudes (eras,). responses: of the fingers to these ERAs.
     """
-    t, free = found.targets, ONSET_KNOTS - 1
-    steady = amplitudes * found.steady
-    power = _expected_power(steady[t:], gain_variance) / _expected_power(steady[:t], gain_variance)
+    t = responses.targets
+    free = ONSET_KNOTS - 1
+    steady = amplitudes * responses.steady
+    quiet_power = _expected_power(steady[t:], gain_variance)
+    target_power = _expected_power(steady[:t], gain_variance)
     weights = np.ones((len(steady), 1, 1), dtype=np.float32)
-    weights[:t] = TARGET_WEIGHT * math.sqrt(power)
-    hats = found.hats * weights
-    combinations = _combinations(hats, amplitudes, found.combinations)
+    weights[:t] = TARGET_WEIGHT * math.sqrt(quiet_power / target_power)
+    hats = responses.hats * weights
+    combinations = _combinations(hats, amplitudes, responses.combinations)
     combined: _ComplexArray = hats @ combinations
     count = combinations.shape[1]
     form = _summed(combined, gain_variance)
@@ -145,8 +147,9 @@ def _combinations(hats: Complex64Array, amplitudes: ComplexArray, count: int) ->
         return np.eye(eras, dtype=np.complex64)
     flat = hats.reshape(-1, eras)
     _, vectors = np.linalg.eigh(flat.conj().T @ flat)
-    some = np.column_stack([amplitudes, vectors[:, 1 - count :]])
-    return np.asarray(np.linalg.qr(some)[0], dtype=np.complex64)
+    spanning = np.column_stack([amplitudes, vectors[:, 1 - count :]])
+    orthonormal, _ = np.linalg.qr(spanning)
+    return np.asarray(orthonormal, dtype=np.complex64)
 
 
 def risen() -> FloatArray:
@@ -171,12 +174,12 @@ def ending_by_numpy(
     carrier: Carrier,
     amplitudes: ComplexArray,
     active: IntArray,
-    found: FingerResponses | None,
+    responses: FingerResponses | None,
     weight: float,
 ) -> ComplexArray:
     """Find the knots (free, active) in strokes of an ending that brings the whole plate to rest.
 
-    All but the last knots, which are zero. amplitudes (eras,); found: responses to the active ERAs
+    All but the last knots, which are zero. amplitudes (eras,); responses: to the active ERAs
     at quiet fingers that are kept quiet meanwhile.
     """
     eras, total = len(active), len(amplitudes)
@@ -187,15 +190,15 @@ def ending_by_numpy(
         form = form[np.ix_(rows, rows)]
     right = -(form[eras:, :eras] @ start)
     form = form[eras:, eras:]
-    if found is not None:
-        quiet_form, quiet_right = while_ending(found, start, carrier.gain_variance)
+    if responses is not None:
+        quiet_form, quiet_right = while_ending(responses, start, carrier.gain_variance)
         form = form + np.float32(weight) * quiet_form
         right += np.float32(weight) * quiet_right
     return bounded_minimum(form, right.reshape(-1, eras), np.eye(eras, dtype=np.complex64))
 
 
 def while_ending(
-    found: FingerResponses, start: ComplexArray, gain_variance: float
+    responses: FingerResponses, start: ComplexArray, gain_variance: float
 ) -> tuple[_ComplexArray, _ComplexArray]:
     """Return form and right-hand side of the mean square at quiet fingers during an ending.
 
@@ -203,9 +206,9 @@ def while_ending(
     difference to the start.
     """
     count = ENDING_KNOTS * SAMPLES
-    hats = found.hats[:, found.targets :, -ENDING_KNOTS:]
+    hats = responses.hats[:, responses.targets :, -ENDING_KNOTS:]
     form = _summed(hats / np.float32(math.sqrt(count)), gain_variance)
-    tones = start * found.steady[found.targets :]
+    tones = start * responses.steady[responses.targets :]
     tones = tones.sum(axis=1, keepdims=True) + gain_variance * tones  # with errors, as the form
     by_knot = (hats.sum(axis=0).conj() * tones[:, None]).sum(axis=0)
     along = by_knot[::-1].cumsum(axis=0)[::-1].ravel() / count

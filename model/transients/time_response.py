@@ -238,7 +238,8 @@ class PlateInTime:
 
     def following_all(self, s: ComplexArray, weights: ComplexArray) -> ComplexArray:
         """Return z (f, 2 r) by weights (f, eras) of all ERAs in full strokes, s (f,) [1/s]."""
-        forces = weights * self._bases(s) * (self.by_drive + s[:, None] * self.by_rate)
+        impedance = self.by_drive + s[:, None] * self.by_rate
+        forces = weights * self._bases(s) * impedance
         return forces @ self.participation.T / (s[:, None] - self.eigenvalues)
 
     def _bases(self, s: ComplexArray) -> ComplexArray:
@@ -490,9 +491,10 @@ def _response_under_fingers(
     by_bases = (driven @ plate.participation.T).astype(np.complex64)  # (2, 2 r)
     by_fingers = (shapes[point_count:] @ plate.forced.T).astype(np.complex64)  # (k, 2 r)
     sources = np.concatenate([by_bases, by_fingers])
-    residues = (sources[:, None] * modal_shapes).reshape(-1, modal_shapes.shape[1])
+    residues = sources[:, None] * modal_shapes
     poles = (1 / (s[:, None] - plate.eigenvalues)).astype(np.complex64)
-    by_source = (poles @ residues.T).reshape(len(s), len(sources), len(shapes)).astype(complex)
+    displacements_by_source = poles @ residues.reshape(-1, modal_shapes.shape[1]).T
+    by_source = displacements_by_source.reshape(len(s), len(sources), len(shapes)).astype(complex)
     by_drive = by_source[:, 0] + s[:, None] * by_source[:, 1]
     displacements = by_drive[:, :point_count]
     if finger_count:

@@ -20,7 +20,7 @@ With L = 1 - T Z, a change dA of the free receptance and dZ of the attachments c
 - T dZ T. For a mode, a position or an attachment this change has rank one or two. A sensor of mass
 m that is on the plate during its measurement adds l² w² m T_sj dT_ss to l dT_sj.
 
-A vector x has one number per parameter, in standard deviations of the prior. `ParameterKind`
+A vector x has one number per parameter, relative to its prior (`Prior.std`). `ParameterKind`
 defines how all parameters of a kind change the plate and its responses; `model.estimate.parameters`
 has one class per kind. `Space` names the parameters of a rig, `PlateValues` contains the values
 that they represent.
@@ -153,7 +153,7 @@ def values_of_eras(rig: Rig, kind: str) -> FloatArray:
 class ParameterKind(ABC):
     """Parameters of a kind, such as the stiffness of each ERA; see `model.estimate.parameters`.
 
-    Parameters are deviations from the rig, usually logarithms of factors.
+    Parameters are differences from the rig, usually logarithms of factors.
     """
 
     name: str
@@ -161,7 +161,7 @@ class ParameterKind(ABC):
     label: str
     """Name of a parameter in reports, without the name of its ERA, sensor or mode."""
     std: float
-    """Standard deviation for a plate without a measurement, in the unit of `PlateValues`."""
+    """Default of `Prior.std`, for a plate without a measurement."""
     unit = "%"
     """Unit in printed reports; logarithms of factors are printed in per cent."""
     per_unit = 100.0
@@ -192,17 +192,17 @@ class ParameterKind(ABC):
         return Prior(0.0)
 
     def value(self, values: "PlateValues") -> Any:
-        """Convert the parameters to the rig's value; default: the deviations themselves."""
+        """Convert the parameters to the rig's value; default: the differences themselves."""
         return values.deviations(self.name)
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Names of all p parameters with their standard deviations, bounds and kinds."""
+    """Names of all p parameters with their priors and kinds."""
 
     names: tuple[str, ...]
     std: FloatArray
-    """Standard deviations (p,) in the units of `PlateValues`, 0 for a known parameter."""
+    """`Prior.std` (p,) in the units of `PlateValues`, 0 for a known parameter."""
     lower: FloatArray
     """Lower bounds of x (p,)."""
     upper: FloatArray
@@ -225,7 +225,7 @@ class Space:
 
     @cached_property
     def scale(self) -> FloatArray:
-        """Standard deviations (p,), 1 for known parameters."""
+        """`std` (p,), 1 for known parameters."""
         return np.where(self.std > 0, self.std, 1.0)
 
     @cached_property
@@ -268,7 +268,7 @@ class Space:
         return range(*self.groups[kind].indices(self.size))
 
     def values(self, x: FloatArray, kind: str) -> FloatArray:
-        """Return the deviations of a kind's parameters from the rig, in their units, for x (p,)."""
+        """Return the differences of a kind's parameters from the rig at x (p,), in their units."""
         part = self.groups[kind]
         return self.std[part] * x[part]
 
@@ -290,7 +290,7 @@ class PlateValues:
     x: FloatArray
 
     def deviations(self, kind: str) -> FloatArray:
-        """Return the deviations of all parameters of a kind from the rig, in their unit."""
+        """Return the differences of all parameters of a kind from the rig, in their unit."""
         return self.space.values(self.x, kind)
 
     def factor(self, kind: str) -> float:
@@ -298,7 +298,7 @@ class PlateValues:
         return float(np.exp(self.deviations(kind)[0]))
 
     def __getitem__(self, kind: str) -> Any:
-        """Return the values of a kind, without deviations of other kinds that are added
+        """Return the values of a kind, without differences of other kinds that are added
         elsewhere."""
         return self.space.kinds[kind].value(self)
 

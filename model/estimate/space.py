@@ -23,8 +23,8 @@ UNIT_KEYS = {"%": "percent", "°": "deg", "/kHz²": "1/kHz^2", "/kHz": "1/kHz"}
 """Units in JSON reports, where these differ from the units in printed reports."""
 
 MAX_GUESSED = math.sqrt(0.5)
-"""Standard error of a parameter with a prior, in its deviations, above which the prior determines
-it more than the data do."""
+"""Standard error of a parameter relative to its prior, above which the prior determines it more
+than the data do."""
 
 VALUE_UNITS = {
     "length": "m",
@@ -90,7 +90,7 @@ def space_from_datasheets(rig: Rig, sensors: Sequence[str], form_modes: int | No
 
 
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
-    """Move positions in x (p,) that are on an edge of the plate inwards, by standard deviations.
+    """Move positions in x (p,) that are on an edge of the plate inwards; by: relative to the prior.
 
     On an edge a position can vary in one direction only, so a start there would cover only half of
     its neighbourhood.

@@ -29,6 +29,7 @@ MAX_PREDICTION_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
 
 _MIN_UNCERTAINTY = 1e-4  # no fit is exact
+_MAX_LOSS_ERROR = 100.0  # of a logarithm; a loss that is fitted as nearly zero has a larger one
 
 # Relative model errors: of all values except the loss factor, and of the loss factor. Unmodeled
 # form errors widen resonances by 0.4 % (RMS over plates without noise).
@@ -400,10 +401,13 @@ class Calibration:
         """
         original = self.plate.rig.uncertainty
         loss = self._kind_error("loss_factor", model_error=self._loss_error)
+        loss = max(loss, self._kind_error("damping"))
+        if loss < math.inf:
+            loss = min(loss, _MAX_LOSS_ERROR)
         errors = self._field_errors | {
             "place": self._place_error,
             "stiffness": self._kind_error("stiffness"),
-            "damping": math.expm1(max(loss, self._kind_error("damping"))),
+            "damping": math.expm1(loss),
         }
         if any(parameter.foot for parameter in self.parameters):
             unidentified = math.hypot(original.supports, _MODEL_ERROR)

@@ -275,6 +275,19 @@ def test_calibrate_refuses_what_tells_nothing(coarse, truth):
             calibrate(coarse, responses)
 
 
+def test_calibrate_is_not_good_for_a_plate_that_is_shorter_than_its_rig() -> None:
+    """A plate 20 % longer in its rig is fitted with nearly no loss, whose error is limited."""
+    paper = make_paper_rig(12, 9)
+    frequencies = CALIBRATION_FREQUENCIES
+    responses = measured(perturbed(paper, frequencies=frequencies))
+    plate = replace(paper.plate, length=1.2 * paper.plate.length)
+    eras = tuple(replace(era, x=1.2 * era.x) for era in paper.eras)
+    mesh = SpectralMesh(12, 9, plate.length, plate.width)
+    calibration = calibrate(replace(paper, plate=plate, eras=eras, mesh=mesh), responses)
+    assert not calibration.is_good
+    assert calibration.rig.uncertainty.damping == 4.0
+
+
 RIG = make_paper_rig(12, 9)
 POINTS = np.random.default_rng(0).uniform(0.02, 0.2, (5, 2))
 NAMES = tuple(f"P{number}" for number in range(len(POINTS)))

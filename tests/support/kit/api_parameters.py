@@ -1,4 +1,4 @@
-"""Valid parameters of every method of the API, for tests that call all of them."""
+"""Valid parameters and results of the methods of the API, for tests that call all of them."""
 
 from collections.abc import Mapping
 
@@ -19,3 +19,10 @@ API_PARAMETERS: Mapping[str, Mapping[str, object]] = {
     "subscribe": {"topics": ["state"]},
     "unsubscribe": {"topics": ["state"]},
 }
+
+API_RESULTS: Mapping[str, Mapping[str, object]] = {
+    "renew": {"lease_s": 5.0},
+    "layout": {"layout": "home", "layouts": ["home"]},
+    "reload": {"reloaded": True, "reasons": []},
+}
+"""Results of a scripted daemon; methods without a row have no required results."""

@@ -39,9 +39,6 @@ from controller.api.methods import (
     EffectsResult,
     HelloParams,
     HelloResult,
-    LayoutResult,
-    ReloadResult,
-    RenewResult,
     StateEvent,
     StatusResult,
     StopResult,
@@ -52,7 +49,6 @@ from controller.api.schema import (
     AmplifierSilence,
     ApiMessage,
     EffectDescription,
-    Empty,
     EraPosition,
     LatencySummary,
     RigSummary,
@@ -60,6 +56,7 @@ from controller.api.schema import (
     Topic,
 )
 from controller.api.server import ApiServer, Connection
+from kit.api_parameters import API_RESULTS
 from kit.plates import write_rig
 from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
@@ -158,15 +155,9 @@ class ScriptedDaemon:
         match name:
             case "hello":
                 return self._hello()
-            case "renew":
-                return RenewResult(lease_s=5.0)
             case "effects":
                 tap = EffectDescription(name="tap", kind="click", description="", parameters={})
                 return EffectsResult(effects=[tap])
-            case "layout":
-                return LayoutResult(layout="home", layouts=["home"])
-            case "reload":
-                return ReloadResult(reloaded=True, reasons=[])
             case "play":
                 raise RpcError(ErrorCode.REFUSED, "there is no such effect", remedy="see effects")
             case "status":
@@ -176,7 +167,7 @@ class ScriptedDaemon:
             case "stop":
                 return StopResult(epoch=1)
             case _:
-                return Empty()
+                return METHODS[name].result.model_validate(API_RESULTS.get(name, {}))
 
     def _hello(self) -> HelloResult:
         rig = parse_rig("rig.yaml", self._rig_text)

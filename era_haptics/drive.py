@@ -50,94 +50,96 @@ def warn_of_surface(rig: Rig) -> None:
         warnings.warn(note, stacklevel=3)
 
 
-def as_frequencies(given: object) -> FloatArray:
+def as_frequencies(value: object) -> FloatArray:
     """Convert to frequencies (f,) [Hz], at least one, in the given order."""
     rule = "frequencies must be a sequence of numbers in hertz, such as range(60, 321, 10)"
-    return _row(given, rule, least=1)
+    return _row(value, rule, min_count=1)
 
 
-def as_loads(given: object) -> tuple[float, ...]:
+def as_loads(value: object) -> tuple[float, ...]:
     """Check finger loads for a query; raises InputError for anything but a sequence of numbers."""
     rule = (
         "loads must be a sequence with one number per finger, relative to the rig's fingertip, "
         "such as [1, 1.5]"
     )
-    return tuple(_row(given, rule).tolist())
+    return tuple(_row(value, rule).tolist())
 
 
 def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
     """Check positions for a query; `what` names the argument in the InputError."""
-    found = _numbers(positions)
-    if found.size == 0:
+    coordinates = _numbers(positions)
+    if coordinates.size == 0:
         return ()
-    if found.ndim > 2 or found.shape[-1:] != (2,):
+    if coordinates.ndim > 2 or coordinates.shape[-1:] != (2,):
         raise InputError(
             f"{what} must be x, y in meters from the corner SW, such as (0.08, 0.06), or a list of "
             f"such pairs, got {positions!r}"
         )
-    return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))
+    return tuple((float(x), float(y)) for x, y in coordinates.reshape(-1, 2))
 
 
-def as_fingers(given: object, *, what: str) -> tuple[Finger, ...]:
+def as_fingers(value: object, *, what: str) -> tuple[Finger, ...]:
     """Convert to fingers, positions without a stimulus; `what` names the argument in the
     InputError."""
-    if isinstance(given, Sequence) and any(isinstance(each, Finger) for each in given):
-        return tuple(
-            each if isinstance(each, Finger) else Finger(cast(Point, each)) for each in given
-        )
-    return tuple(map(Finger, as_points(cast(Positions, given), what=what)))
+    if not isinstance(value, Sequence) or not any(isinstance(item, Finger) for item in value):
+        return tuple(map(Finger, as_points(cast(Positions, value), what=what)))
+    fingers = []
+    for item in value:
+        fingers.append(item if isinstance(item, Finger) else Finger(cast(Point, item)))
+    return tuple(fingers)
 
 
-def as_signals(given: object, rig: Rig, sample_rate: object) -> FloatArray:
+def as_signals(value: object, rig: Rig, sample_rate: object) -> FloatArray:
     """Check signals of all ERAs (eras, n), 1 = full stroke; raises InputError if an ERA cannot play
     them."""
     expect_number(sample_rate, what="sample_rate", unit="hertz")
-    least = 2 * rig.limits.frequency_max
-    if not least < cast(float, sample_rate) < math.inf:
+    min_rate = 2 * rig.limits.frequency_max
+    if not min_rate < cast(float, sample_rate) < math.inf:
         raise InputError(
-            f"sample_rate must be above {least:g} Hz, twice the rig's highest frequency, got "
+            f"sample_rate must be above {min_rate:g} Hz, twice the rig's highest frequency, got "
             f"{sample_rate} Hz"
         )
-    found = _numbers(given)
-    if found.ndim != 2 or len(found) != len(rig.eras) or not found.size:
-        got = f"shape {np.shape(given)}" if isinstance(given, np.ndarray) else shown(given)
+    signals = _numbers(value)
+    if signals.ndim != 2 or len(signals) != len(rig.eras) or not signals.size:
+        got = f"shape {np.shape(value)}" if isinstance(value, np.ndarray) else shown(value)
+        names = ", ".join(era.name for era in rig.eras)
         raise InputError(
             f"signals must be real numbers ({len(rig.eras)}, samples), a row for each ERA, "
-            f"{', '.join(each.name for each in rig.eras)}, got {got}"
+            f"{names}, got {got}"
         )
-    beyond = np.argwhere(~(np.abs(found) <= MAX_LEVEL))  # NaN, too
+    beyond = np.argwhere(~(np.abs(signals) <= MAX_LEVEL))  # NaN, too
     if len(beyond):
         row, sample = beyond[0].tolist()
         raise InputError(
-            f"signals must be within full stroke, -1 to 1, got {found[row, sample]} of "
+            f"signals must be within full stroke, -1 to 1, got {signals[row, sample]} of "
             f"{rig.eras[row].name} at sample {sample}"
         )
-    return np.clip(found, -1, 1)
+    return np.clip(signals, -1, 1)
 
 
-def as_pair(given: object, *, what: str, such_as: str) -> tuple[int, int]:
+def as_pair(value: object, *, what: str, such_as: str) -> tuple[int, int]:
     """Convert to two integers, also from an array; raises InputError for anything else."""
-    pair = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
+    pair = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()
     if len(pair) != 2 or not all(is_whole(count) for count in pair):
-        raise InputError(f"{what} must be two whole numbers, {such_as}, got {shown(given)}")
+        raise InputError(f"{what} must be two whole numbers, {such_as}, got {shown(value)}")
     return int(pair[0]), int(pair[1])
 
 
-def _row(given: object, rule: str, *, least: int = 0) -> FloatArray:
+def _row(value: object, rule: str, *, min_count: int = 0) -> FloatArray:
     """Convert a sequence of numbers to an array (n,); raises InputError, with `rule` in its
     text."""
-    found = _numbers(given)
-    if found.ndim != 1 or len(found) < least:
-        raise InputError(f"{rule}, got {shown(given)}")
-    return found
+    row = _numbers(value)
+    if row.ndim != 1 or len(row) < min_count:
+        raise InputError(f"{rule}, got {shown(value)}")
+    return row
 
 
-def _numbers(given: Any) -> FloatArray:
+def _numbers(value: Any) -> FloatArray:
     """Convert numbers to an array; anything else becomes a 3-D array, which all callers reject."""
     try:
-        if np.iscomplexobj(given):
+        if np.iscomplexobj(value):
             raise TypeError
-        return np.asarray(given, dtype=float)
+        return np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         return np.full((1, 1, 1), np.nan)
 
@@ -156,10 +158,11 @@ class Drive:
     def __post_init__(self) -> None:
         """Check types and ranges."""
         for key in ("frequency", "level", "phase_deg"):
-            if not isinstance(getattr(self, key), Real):
+            value = getattr(self, key)
+            if not isinstance(value, Real):
                 raise InputError(
                     f"{key} of a drive must be a number, in hertz, fraction of full stroke or "
-                    f"degrees, got {getattr(self, key)!r}"
+                    f"degrees, got {value!r}"
                 )
         if not (0 < self.frequency < math.inf):
             raise InputError(
@@ -185,29 +188,25 @@ Played: TypeAlias = Answer | Layer | Drives
 
 
 def playable_layers(drive: Played, rig: Rig) -> tuple[Layer, ...]:
-    """Return the layers of an answer, of one layer, or of drives, checked against the rig.
+    """Return the layers of a drive, checked against the rig.
 
     Raises InputError for an answer without layers, an unknown ERA, a frequency outside the rig's
     limits, or drives whose sum at an ERA exceeds full stroke.
     """
-    if isinstance(drive, Answer | Layer):
-        layers = drive.layers if isinstance(drive, Answer) else (drive,)
+    if isinstance(drive, Answer):
+        layers = drive.layers
         if not layers:
             raise InputError(
                 "an answer must have a layer to be played, got one with quiet fingers only"
             )
     else:
-        layers = (_layer_of(drive, rig),)
-    limits, levels = rig.limits, defaultdict[str, float](float)
-    tones = [item for one in layers for each in one.excitations for item in each.items()]
-    for name, tone in tones:
-        if not limits.frequency_min <= tone.frequency <= limits.frequency_max:
-            raise InputError(
-                f"frequency of {name} must be from {limits.frequency_min:g} to "
-                f"{limits.frequency_max:g} Hz, got {tone.frequency} Hz; widen limits.frequency of "
-                "the rig"
-            )
-        levels[name] += abs(tone.amplitude) / rig.era(name).full_level
+        layers = (drive if isinstance(drive, Layer) else _layer_of(drive, rig),)
+    levels = defaultdict[str, float](float)
+    for layer in layers:
+        for excitation in layer.excitations:
+            for name, tone in excitation.items():
+                _check_frequency(name, tone.frequency, rig)
+                levels[name] += abs(tone.amplitude) / rig.era(name).full_level
     for name, level in levels.items():
         if not level <= _MAX_SUM:  # NaN, too
             raise InputError(
@@ -215,6 +214,17 @@ def playable_layers(drive: Played, rig: Rig) -> tuple[Layer, ...]:
                 f"{rig.era(name).full_level:g} {rig.era(name).UNIT}, got {level}"
             )
     return layers
+
+
+def _check_frequency(name: str, frequency: float, rig: Rig) -> None:
+    """Raise InputError for a frequency [Hz] of an ERA outside the rig's limits."""
+    limits = rig.limits
+    if not limits.frequency_min <= frequency <= limits.frequency_max:
+        raise InputError(
+            f"frequency of {name} must be from {limits.frequency_min:g} to "
+            f"{limits.frequency_max:g} Hz, got {frequency} Hz; widen limits.frequency of "
+            "the rig"
+        )
 
 
 def _layer_of(drive: object, rig: Rig) -> Layer:
@@ -225,29 +235,29 @@ def _layer_of(drive: object, rig: Rig) -> Layer:
             f'{{"SW": 110}}, got {shown(drive)}'
         )
     tones: dict[str, list[Tone]] = {}
-    for name, given in drive.items():
-        tones[name] = [
-            _tone_of(one, name, rig) for one in (given if isinstance(given, list) else [given])
-        ]
+    for name, driven in drive.items():
+        drives = driven if isinstance(driven, list) else [driven]
+        tones[name] = [_tone_of(item, name, rig) for item in drives]
     count = max([1, *map(len, tones.values())])
-    excitation, *others = (
-        {name: each[number] for name, each in tones.items() if number < len(each)}
-        for number in range(count)
-    )
-    return Layer(excitation, side_bands=tuple(others))
+    excitations = []
+    for number in range(count):
+        with_tone = {name: row for name, row in tones.items() if number < len(row)}
+        excitations.append({name: row[number] for name, row in with_tone.items()})
+    return Layer(excitations[0], side_bands=tuple(excitations[1:]))
 
 
-def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
+def _tone_of(driven: Driven, name: str, rig: Rig) -> Tone:
     """Convert an ERA's drive to a tone; raises InputError for anything else."""
     stroke = rig.era(name).full_level
-    if isinstance(given, tuple):
+    if isinstance(driven, tuple):
         raise InputError(
             f"drive of {name} must be a frequency, a Drive, a Tone or a list of drives, got "
-            f"{given}; make one drive with era.Drive(110, 0.5, 90)"
+            f"{driven}; make one drive with era.Drive(110, 0.5, 90)"
         )
-    if isinstance(given, Tone):
+    if isinstance(driven, Tone):
         for key, unit in _UNITS_OF_A_TONE.items():
-            expect_number(getattr(given, key), what=f"{key} of the tone of {name}", unit=unit)
-        return given
-    one = given if isinstance(given, Drive) else Drive(given)
-    return Tone(float(one.frequency), float(one.level) * stroke, math.radians(one.phase_deg))
+            expect_number(getattr(driven, key), what=f"{key} of the tone of {name}", unit=unit)
+        return driven
+    drive = driven if isinstance(driven, Drive) else Drive(driven)
+    level = float(drive.level) * stroke
+    return Tone(float(drive.frequency), level, math.radians(drive.phase_deg))

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 PACKAGES = ("controller", "drivers", "model", "registry", "sim")
-_OWN = "of era-haptics"  # in every package's docstring
+_MARK = "of era-haptics"  # in every package's docstring
 
 
 class HiddenPackage(ImportError):
@@ -38,9 +38,9 @@ def drop_foreign_backend() -> None:
 
     matplotlib cannot be imported with a missing backend. In the notebook itself the variable stays.
     """
-    named = os.environ.get("MPLBACKEND", "").partition("module://")[2]
+    backend = os.environ.get("MPLBACKEND", "").partition("module://")[2]
     try:
-        is_foreign = named != "" and find_spec(named) is None
+        is_foreign = backend != "" and find_spec(backend) is None
     except ImportError:
         is_foreign = True
     if is_foreign:
@@ -48,31 +48,42 @@ def drop_foreign_backend() -> None:
 
 
 def _check(package: str) -> None:
-    own = Path(__file__).resolve().parents[1] / package / "__init__.py"
-    loaded = sys.modules.get(package)  # can lack a specification
-    found = find_spec(package) if loaded is None else None
-    origin = Path(getattr(loaded, "__file__", None) or (found and found.origin) or own)
-    if not own.exists():
-        why = f"{own.parent} is missing"
-    elif origin.resolve() != own:
-        why = f"{origin.parent if origin.name == own.name else origin} hides {own.parent}"
-    elif _OWN not in own.read_text(encoding="utf-8"):
-        why = f"{own} is another program's"
+    """Raise HiddenPackage unless Python imports the package that belongs to this program."""
+    own_file = Path(__file__).resolve().parents[1] / package / "__init__.py"
+    origin = _origin(package) or own_file
+    if not own_file.exists():
+        problem = f"{own_file.parent} is missing"
+    elif origin.resolve() != own_file:
+        hiding = origin.parent if origin.name == own_file.name else origin
+        problem = f"{hiding} hides {own_file.parent}"
+    elif _MARK not in own_file.read_text(encoding="utf-8"):
+        problem = f"{own_file} is another program's"
     else:
         return
-    other = _distribution(origin)
-    by = "" if other is None else f", by the distribution {other}"
+    name = _distribution(origin)
+    source = "" if name is None else f", by the distribution {name}"
     raise HiddenPackage(
-        f"{why}{by}, the package {package} of "
+        f"{problem}{source}, the package {package} of "
         "era-haptics; rename the other, or install era-haptics in an environment of its own",
         name=package,
     )
 
 
+def _origin(package: str) -> Path | None:
+    """Return the file that Python has imported or would import as a package; None without one."""
+    module = sys.modules.get(package)  # can lack a specification
+    if module is not None:
+        file = getattr(module, "__file__", None)
+    else:
+        spec = find_spec(package)
+        file = None if spec is None else spec.origin
+    return Path(file) if file else None
+
+
 def _distribution(file: Path) -> str | None:
     """Return the name of another installed distribution that contains a file; None without one."""
-    for each in distributions():
-        files = map(str, map(each.locate_file, each.files or ()))
-        if each.name != "era-haptics" and str(file) in files:
-            return each.name
+    for distribution in distributions():
+        paths = map(distribution.locate_file, distribution.files or ())
+        if distribution.name != "era-haptics" and str(file) in map(str, paths):
+            return distribution.name
     return None

@@ -3,7 +3,7 @@
 Pictures are matplotlib figures, made without pyplot.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -118,19 +118,22 @@ class SolvedPlate:
         if seed is not None:
             drawn = SolvedPlate(self.rig, seed=seed)
             return drawn.responses(points, frequencies, fingers=fingers)
-        resting, places = as_fingers(fingers, what="fingers"), as_points(points, what="points")
-        check_on_plate("point", places, self._real.plate)
-        check_on_plate("finger", [each.at for each in resting], self._real.plate)
-        check_loads([each.load for each in resting])
-        found = self._free.acceleration(
+        resting = as_fingers(fingers, what="fingers")
+        positions = as_points(points, what="points")
+        check_on_plate("point", positions, self._real.plate)
+        check_on_plate("finger", [finger.at for finger in resting], self._real.plate)
+        check_loads([finger.load for finger in resting])
+        if frequencies is None:
+            hertz = default_drive_frequencies(self.rig.limits)
+        else:
+            hertz = as_frequencies(frequencies)
+        accelerations = self._free.acceleration(
             self._real.eras,
-            default_drive_frequencies(self.rig.limits)
-            if frequencies is None
-            else as_frequencies(frequencies),
-            np.reshape(places, (-1, 2)),
+            hertz,
+            np.reshape(positions, (-1, 2)),
             loads=[*self._real.masses, *self._drawn.resting(self.rig, resting)],
         )
-        return found * self._drawn.factors(self.rig)[:, None]
+        return accelerations * self._drawn.factors(self.rig)[:, None]
 
     def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
@@ -146,22 +149,23 @@ class SolvedPlate:
             >>> f"largest {field.peak.max():.0f} m/s², {len(field.nulls)} nulls"
             'largest 113 m/s², 16 nulls'
         """
-        points = (
-            None
-            if raster is None
-            else as_pair(raster, what="raster", such_as="points along x and y such as (61, 46)")
-        )
+        points = None
+        if raster is not None:
+            such_as = "points along x and y such as (61, 46)"
+            points = as_pair(raster, what="raster", such_as=such_as)
+        excitations = []
+        for layer in playable_layers(drive, self.rig):
+            excitations += [self._played(excitation) for excitation in layer.excitations]
+        return plate_map(self._real, *excitations, raster=points, free=self._free)
+
+    def _played(self, excitation: Mapping[str, Tone]) -> dict[str, Tone]:
+        """Return an excitation as this plate's channels play it."""
         names = [era.name for era in self.rig.eras]
         factors = dict(zip(names, self._drawn.factors(self.rig).tolist(), strict=True))
-        excitations = [
-            {
-                name: Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
-                for name, tone in each.items()
-            }
-            for layer in playable_layers(drive, self.rig)
-            for each in layer.excitations
-        ]
-        return plate_map(self._real, *excitations, raster=points, free=self._free)
+        tones = {}
+        for name, tone in excitation.items():
+            tones[name] = Tone.from_phasor(tone.frequency, factors[name] * tone.phasor)
+        return tones
 
     def play(
         self,
@@ -194,11 +198,12 @@ class SolvedPlate:
         """
         if duration is not None:
             expect_number(duration, what="duration", unit="seconds")
-        others, weighed = as_points(quiet, what="quiet"), as_loads(loads)
-        placed = None if target is None else as_points(target, what="target")
-        if placed is not None:
-            fingers = together(Placement(placed, others, weighed), Stimulus())
-        elif isinstance(drive, Answer) and not others and not weighed:
+        quiet_positions = as_points(quiet, what="quiet")
+        finger_loads = as_loads(loads)
+        targets = None if target is None else as_points(target, what="target")
+        if targets is not None:
+            fingers = together(Placement(targets, quiet_positions, finger_loads), Stimulus())
+        elif isinstance(drive, Answer) and not quiet_positions and not finger_loads:
             fingers = [*drive.asked]
         else:
             raise InputError(
@@ -215,9 +220,9 @@ class SolvedPlate:
                 imperfections=self._drawn,
             )
         layers = playable_layers(drive, self.rig)
-        if placed is not None:
-            own = tuple(range(len(placed)))
-            layers = tuple([replace(each, fingers=own) for each in layers])
+        if targets is not None:
+            numbers = tuple(range(len(targets)))
+            layers = tuple([replace(layer, fingers=numbers) for layer in layers])
         return play(
             self.rig,
             self._reduced,
@@ -251,7 +256,9 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
 
     expect_instance(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
     layers = playable_layers(drive, plate.rig)
-    active = {name for layer in layers for each in layer.excitations for name in each}
+    active: set[str] = set()
+    for layer in layers:
+        active.update(*layer.excitations)
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
 
@@ -289,16 +296,12 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     expect_instance(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one with quiet fingers only")
-    return contents_figure(
-        table,
-        answer.layers,
-        [
-            replace(
-                each, level_db_sl=each.promised_level_db_sl, contrast_db=each.promised_contrast_db
-            )
-            for each in answer.fingers
-        ],
-    )
+    promised = []
+    for finger in answer.fingers:
+        level = finger.promised_level_db_sl
+        contrast = finger.promised_contrast_db
+        promised.append(replace(finger, level_db_sl=level, contrast_db=contrast))
+    return contents_figure(table, answer.layers, promised)
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":

@@ -71,13 +71,15 @@ def open_amplifier(
         4 channels
     """
     expect_rig(rig)
-    known = tuple(rig.amplifiers)
-    chosen = known if name is None else tuple(each for each in known if each == name)
-    if len(chosen) != 1:
-        raise InputError(f"name must be an amplifier of the rig, {', '.join(known)}, got {name!r}")
+    names = tuple(rig.amplifiers)
+    if name is None and len(names) == 1:
+        amplifier = names[0]
+    elif name in names:
+        amplifier = name
+    else:
+        raise InputError(f"name must be an amplifier of the rig, {', '.join(names)}, got {name!r}")
     if url is not None and not isinstance(url, str):
         raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
-    (amplifier,) = chosen
     url = url or rig.amplifiers[amplifier]
     if url == "sim://":
         return _simulated_amplifier(rig, amplifier)
@@ -108,18 +110,19 @@ def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...
     """
     expect_rig(rig)
     voices = [voice for layer in playable_layers(drive, rig) for voice in layer.voices]
-    routed = [
-        route(
-            each.excitation,
+    commands: dict[str, list[AmplifierLayer]] = {name: [] for name in rig.amplifiers}
+    for number, voice in enumerate(voices):
+        routed = route(
+            voice.excitation,
             rig,
-            ramp=each.ramp,
+            ramp=voice.ramp,
             number=number,
-            onset=each.onset,
-            ending=each.ending,
+            onset=voice.onset,
+            ending=voice.ending,
         )
-        for number, each in enumerate(voices)
-    ]
-    return {name: tuple([each[name] for each in routed]) for name in rig.amplifiers}
+        for name in rig.amplifiers:
+            commands[name].append(routed[name])
+    return {name: tuple(layers) for name, layers in commands.items()}
 
 
 def calibrate(

@@ -129,7 +129,7 @@ def answer(
     expect_number(apart_hz, what="apart_hz", unit="hertz")
     if drive_mode is not None:
         _expect_mode(drive_mode)
-    found = _answer(
+    result = _answer(
         table,
         fingers,
         quiet=as_fingers(quiet, what="quiet"),
@@ -138,7 +138,7 @@ def answer(
         apart_hz=apart_hz,
         bands_may_swap=bands_may_swap,
     )
-    return _timing(table).shaped(found) if shaped else found
+    return _timing(table).shaped(result) if shaped else result
 
 
 def measures(table: LocalizationTable, answer: Answer) -> Measures:
@@ -194,10 +194,10 @@ def contrast_map(
     )
 
 
-def _expect_mode(given: object) -> None:
+def _expect_mode(drive_mode: object) -> None:
     """Raise InputError for anything but text."""
-    if not isinstance(given, str):
-        raise InputError(f"drive_mode must be a name such as 'phased', got {shown(given)}")
+    if not isinstance(drive_mode, str):
+        raise InputError(f"drive_mode must be a name such as 'phased', got {shown(drive_mode)}")
 
 
 @lru_cache(maxsize=2)  # notebooks query one table many times, then the next

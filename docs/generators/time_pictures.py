@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from era_haptics.lab.checks.layout_check import loaded_plate
+from era_haptics.lab.checks.touch_simulator import loaded_plate
 from model.answer.envelope import ONSET_RAMP
 from model.answer.plan import query
 from model.answer.stimulus import Placement

@@ -9,7 +9,7 @@ measurement have their own columns, or are in the second line of free text of a 
 `sensor_mass_g=2 setting=level 0.1`.
 
 Sensor positions are read from the accelerometer file, whose other columns describe their inputs
-(`era_haptics.lab.measuring.sound_card`).
+(`era_haptics.lab.measuring.measure`).
 """
 
 import logging

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 _RATE = 48000  # Hz; every audio player supports it with 16 bits
 _MAX_SAMPLE = (1 << 15) - 1  # of 16 bits
 _FULL_SCALE = 20.0  # m/s²; contents at 20 dB SL reach 3 to 5
+_ROWS = 12  # of levels over time
+_REMEDY = "try another position (--at), another sharpness, slower rises or a lower --level"
 
 
 def play(
@@ -140,8 +142,8 @@ def _simulate(
     check_place(output, example="felt.wav")
     check_replaceable(output, is_own=begins_with(output, b"RIFF"), what="WAV file")
     table = load_table(table_file)
-    given = STRONG_DB_SL if level is None else level
-    _, _, rate, accelerations = play_content(pattern, table, given, at=place)
+    level_db_sl = STRONG_DB_SL if level is None else level
+    _, _, rate, accelerations = play_content(pattern, table, level_db_sl, at=place)
     felt = accelerations @ fingertip_weights(*place, table.plate)
     sound = resample(felt, round(len(felt) * _RATE / rate))
     peak = float(np.abs(sound).max())
@@ -360,11 +362,10 @@ def _content_files(paths: "Sequence[Path]") -> list[Path]:
         if not path.is_dir():
             files.append(path)
             continue
-        in_folder = [
-            file
-            for file in sorted(path.rglob("*"))
-            if file.name.lower().endswith(endings) and file.is_file()
-        ]
+        in_folder = []
+        for file in sorted(path.rglob("*")):
+            if file.name.lower().endswith(endings) and file.is_file():
+                in_folder.append(file)
         if not in_folder:
             raise InputError(f"{path}: must contain haptic files ({', '.join(endings)}), got none")
         files += in_folder
@@ -380,7 +381,7 @@ def _check_one(file: Path, setting: _Setting, picture: Path | None, *, as_json: 
     checked = results[len(results) // 2]
     pictures = []
     if picture is not None:
-        from era_haptics.lab.checks.content_check import content_figure
+        from era_haptics.lab.checks.content_figure import content_figure
         from model.figures.style import save_figure
 
         save_figure(content_figure(pattern, checked), picture)
@@ -440,10 +441,6 @@ def _list_row(file: Path, checked: "CheckedContent", setting: _Setting) -> str:
     return f"{level:>5}  {sharpness:>9}  {f'{x:.3f},{y:.3f}':12}  {file}: {verdict}"
 
 
-_ROWS = 12
-_REMEDY = "try another position (--at), another sharpness, slower rises or a lower --level"
-
-
 def _verdict(checked: "CheckedContent", setting: _Setting) -> str:
     """Return the verdict: the first loss that counts, then its details after a semicolon."""
     from era_haptics.lab.checks.content_check import least_promise
@@ -475,16 +472,16 @@ def _position_row(results: "Sequence[CheckedContent]", setting: _Setting) -> Ite
     """Format the kept percentages of several positions, and the position shown."""
     if len(results) == 1:
         return
-    worst, shown, best = results[0], results[len(results) // 2], results[-1]
-    enough = sum(setting.has_enough(checked) for checked in results)
-    extremes = ", ".join(
-        f"{percent_down(checked.kept_share)} at {checked.at[0]:.3f},{checked.at[1]:.3f}"
-        for checked in (worst, best)
-    )
+    median = results[len(results) // 2]
+    good_count = sum(setting.has_enough(checked) for checked in results)
+    extremes = []
+    for checked in (results[0], results[-1]):
+        share = percent_down(checked.kept_share)
+        extremes.append(f"{share} at {checked.at[0]:.3f},{checked.at[1]:.3f}")
     yield (
-        f"{enough} of {len(results)} positions keep at least "
-        f"{_exact_percent(setting.least_share)}: {extremes}; "
-        f"above is {shown.at[0]:.3f},{shown.at[1]:.3f}"
+        f"{good_count} of {len(results)} positions keep at least "
+        f"{_exact_percent(setting.least_share)}: {', '.join(extremes)}; "
+        f"above is {median.at[0]:.3f},{median.at[1]:.3f}"
     )
 
 
@@ -493,11 +490,13 @@ def _lines(checked: "CheckedContent") -> Iterator[str]:
     import numpy as np
 
     yield "     time [s]   wanted   felt [dB SL]"
-    late = round(checked.delay / checked.step)
+    delay = round(checked.delay / checked.step)
     count = round(checked.duration / checked.step)
-    for some in np.array_split(np.arange(count), min(_ROWS, count)):
-        expected, felt = checked.expected[some].max(), checked.given[some + late].max()
-        since, until = checked.step * some[0], checked.step * (some[-1] + 1)
+    for samples in np.array_split(np.arange(count), min(_ROWS, count)):
+        expected = checked.expected[samples].max()
+        felt = checked.given[samples + delay].max()
+        since = checked.step * samples[0]
+        until = checked.step * (samples[-1] + 1)
         yield f"{since:6.2f} {until:6.2f} {_level(expected)} {_level(felt)}"
     yield f"felt {1000 * checked.delay:.0f} ms later"
     lasting = [part for part in checked.parts if part.stimulus.course is not None]
@@ -519,7 +518,7 @@ def _played(parts: "Sequence[Part]") -> str:
     from era_haptics.lab.checks.content_check import least_promise
 
     tones = [part.frequency for part in parts if part.frequency is not None]
-    levels = [part.answer.fingers[0].level_db_sl for part in parts]
+    levels = [part.sensation.level_db_sl for part in parts]
     promised = least_promise(parts)
     contrast = "" if promised is None else f", promised {promised:.1f} dB above quiet fingers"
     return f"{_span(tones)} Hz, up to {max(levels):.1f} dB SL{contrast}"

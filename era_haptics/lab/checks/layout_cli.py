@@ -5,14 +5,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.options import FAILED, JsonOption, print_report
+from model.commands.options import FAILED, JsonOption, Stopwatch, print_report, progress_bar
 from model.quantities import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from era_haptics.lab.checks.joint_touches import JointTouch
     from era_haptics.lab.checks.layout_check import CheckedEffect
-    from model.arrays import FloatArray
+
+_MIN_SHOWN = 0.05  # dB
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts.")
 
@@ -36,12 +38,9 @@ def check(
     lowest promised contrast. Amplifiers are assumed to be phased, even if the table was built
     for switched drives. Exits with status 1 if it finds a problem in a region.
     """
-    import time
-
     from controller.effects.layout import load_layout
+    from era_haptics.lab.checks.joint_touches import check_together, close_pairs
     from era_haptics.lab.checks.layout_check import check_layout
-    from era_haptics.lab.checks.layout_picture import check_together, close_pairs, matrix_of
-    from model.commands.options import progress_bar
     from model.files.output_paths import check_picture_name
     from model.finger import scale_in_words
     from model.table.table_file import load_table
@@ -50,12 +49,11 @@ def check(
         check_picture_name(picture)
     table = load_table(table_file)
     layout = load_layout(layout_file, table.plate).for_table(table.frequencies)
-    started = time.perf_counter()
-    with progress_bar("effects") as progress:
-        checked = check_layout(layout, table, progress=progress)
-    with progress_bar("pairs and triples") as progress:
-        together = check_together(layout, table, progress=progress)
-    elapsed = time.perf_counter() - started
+    with Stopwatch() as stopwatch:
+        with progress_bar("effects") as progress:
+            checked = check_layout(layout, table, progress=progress)
+        with progress_bar("pairs and triples") as progress:
+            together = check_together(layout, table, progress=progress)
     files = []
     if picture is not None:
         from era_haptics.lab.checks.layout_picture import check_figure
@@ -63,61 +61,61 @@ def check(
 
         save_figure(check_figure(layout, table, checked, together), picture)
         files = [str(picture)]
-    problems = sum(len(each.problems) for each in checked)
-    touches = sum(len(each.touches) for each in checked)
-    outcome = counted(problems, "problem") if problems else "good"
-    rows = [
-        scale_in_words(table.threshold),
-        *(line for each in checked for line in _lines(each)),
-        *(_matrix(*matrix_of(together)) if together else ()),
+    problem_count = sum(len(effect.problems) for effect in checked)
+    touch_count = sum(len(effect.touches) for effect in checked)
+    outcome = counted(problem_count, "problem") if problem_count else "good"
+    rows = [scale_in_words(table.threshold)]
+    for effect in checked:
+        rows += _rows_of_effect(effect)
+    if together:
+        rows += _rows_of_matrix(together)
+    rows.append(
         f"{layout_file}: {outcome}{close_pairs(together)}; "
-        f"{counted(touches, 'touch', plural='touches')} in {elapsed:.1f} s",
-        *(f"wrote {name}" for name in files),
-    ]
+        f"{counted(touch_count, 'touch', plural='touches')} in {stopwatch.elapsed:.1f} s"
+    )
+    rows += [f"wrote {name}" for name in files]
     answer = {
-        "regions": [each.as_json() for each in checked],
-        "promised_together": [each.as_json() for each in together],
+        "regions": [effect.as_json() for effect in checked],
+        "promised_together": [touch.as_json() for touch in together],
         "files": files,
-        "check_time_s": elapsed,
+        "check_time_s": stopwatch.elapsed,
     }
     print_report(rows, answer, as_json=as_json)
-    if problems:
+    if problem_count:
         raise typer.Exit(FAILED)
 
 
-_SHOWN_FROM = 0.05  # dB
-
-
-def _lines(each: "CheckedEffect") -> list[str]:
+def _rows_of_effect(effect: "CheckedEffect") -> list[str]:
     """Format one effect of a region."""
     from controller.effects.effect import DEFAULT_MAX_DB_SL
 
-    promised = (
-        "as neighbors allow" if each.promised_db_sl is None else f"{each.promised_db_sl:.3g} dB SL"
-    )
-    lines = [f"{each.region}, {each.on}: {each.effect}, {promised}"]
-    if each.felt:
-        low, high = each.frequencies[0], each.frequencies[-1]
+    level = effect.promised_db_sl
+    promised = "as neighbors allow" if level is None else f"{level:.3g} dB SL"
+    rows = [f"{effect.region}, {effect.on}: {effect.effect}, {promised}"]
+    if effect.felt:
+        low, high = effect.frequencies[0], effect.frequencies[-1]
         tones = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
-        lines.append(f"  felt {_span(each.felt)} dB SL at {tones}")
-    if each.contrasts:
-        lines.append(
-            f"  {_span(each.promised_contrasts)} dB above the level at a resting second finger, on "
-            "90 % of plates"
+        rows.append(f"  felt {_span(effect.felt)} dB SL at {tones}")
+    if effect.contrasts:
+        rows.append(
+            f"  {_span(effect.promised_contrasts)} dB above the level at a resting second finger, "
+            "on 90 % of plates"
         )
-        lines.append(f"  {_span(each.contrasts)} dB nominal")
-    if each.held_back_db > _SHOWN_FROM:
-        held = f"  up to {each.held_back_db:.1f} dB weaker"
-        lines.append(f"{held} so that the resting finger feels at most half of it")
-    if each.promised_db_sl is not None and each.promised_db_sl > DEFAULT_MAX_DB_SL:
-        lines.append(f"  exposure up to {each.exposure_m_s2:.2g} m/s², weighted per ISO 5349-1")
-    return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
+        rows.append(f"  {_span(effect.contrasts)} dB nominal")
+    if effect.held_back_db > _MIN_SHOWN:
+        weaker = f"  up to {effect.held_back_db:.1f} dB weaker"
+        rows.append(f"{weaker} so that the resting finger feels at most half of it")
+    if level is not None and level > DEFAULT_MAX_DB_SL:
+        rows.append(f"  exposure up to {effect.exposure_m_s2:.2g} m/s², weighted per ISO 5349-1")
+    return rows + [f"  PROBLEM {problem}" for problem in effect.problems]
 
 
-def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
+def _rows_of_matrix(together: "Sequence[JointTouch]") -> list[str]:
     """Format the promised contrasts of all pairs and triples of regions."""
+    from era_haptics.lab.checks.joint_touches import matrix_of
     from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 
+    names, promised = matrix_of(together)
     width = max(map(len, names)) + 4
     lines = [
         "promised contrast of the worst finger in dB: pairs of regions below the diagonal, "
@@ -133,7 +131,8 @@ def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
 
 
 def _span(values: list[float]) -> str:
+    """Format the range and the median of values."""
     from era_haptics.lab.checks.layout_check import distribution
 
-    found = distribution(values)
-    return f"{found['min']:.1f} to {found['max']:.1f} (median {found['median']:.1f})"
+    row = distribution(values)
+    return f"{row['min']:.1f} to {row['max']:.1f} (median {row['median']:.1f})"

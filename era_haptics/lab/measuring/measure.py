@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from era_haptics.lab.measuring.desk import Desk, converters, read_sensors
+from era_haptics.lab.measuring.multisine import PERIOD, Multisine, estimate, multisine_frequencies
 from era_haptics.lab.measuring.recording_checks import (
     check_clocks,
     check_coherence,
@@ -22,21 +24,8 @@ from era_haptics.lab.measuring.recording_checks import (
     latency,
     loopback_gain,
 )
-from era_haptics.lab.measuring.sound_card import (
-    PERIOD,
-    TRIES,
-    Desk,
-    Multisine,
-    Run,
-    SoundCard,
-    converters,
-    estimate,
-    multisine_frequencies,
-    open_card,
-    play_and_record,
-    read_sensors,
-    run_time,
-)
+from era_haptics.lab.measuring.runs import TRIES, Run, play_and_record, run_time
+from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
 from model.estimate.measurement import MeasuredPlate, Measurement, Repeat, write_responses
@@ -328,7 +317,7 @@ def _repeats(
     bases = multisine.played(_REPEATED_RUN)[:, : len(full_levels)] * full_levels  # (f, eras)
     norms = np.linalg.norm(bases, axis=1, keepdims=True)
     expected = np.einsum("fse,fe->fs", measured.responses.values, bases) / norms
-    inputs = multisine.found(recorded)[:, desk.columns] / desk.sensitivities
+    inputs = multisine.amplitudes_in(recorded)[:, desk.columns] / desk.sensitivities
     repeated = inputs / converters(measured.looped)[:, None] / norms
     names = ", ".join(name for name, _ in desk.eras)
     strongest = best_first(np.linalg.norm(expected, axis=1))[:_COMPARED_LINES]

@@ -18,18 +18,11 @@ import numpy as np
 import typer
 from scipy.optimize import linear_sum_assignment
 
+from era_haptics.lab.measuring.desk import Desk
+from era_haptics.lab.measuring.multisine import Multisine, ResponseEstimate, estimate, ramped
 from era_haptics.lab.measuring.recording_checks import check_levels
-from era_haptics.lab.measuring.sound_card import (
-    Desk,
-    Multisine,
-    ResponseEstimate,
-    SoundCard,
-    estimate,
-    open_card,
-    play_on_one,
-    ramped,
-    run_time,
-)
+from era_haptics.lab.measuring.runs import play_on_one, run_time
+from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.commands.calibrate_cli import check_rig_output
 from model.commands.options import next_line
@@ -43,8 +36,11 @@ from registry.plugins import did_you_mean
 _TONE = 160.0
 """Usual frequency [Hz] of the tone: felt well, and soft in air."""
 
-BURST, PAUSE = 0.4, 0.2
-"""Time [s] of a burst, ramped over its quarters, and between two."""
+BURST = 0.4
+"""Duration of a burst [s], ramped over its first and last quarter."""
+
+PAUSE = 0.2
+"""Pause after a burst [s]."""
 
 _BURSTS = 3
 _OCTAVES = 4.0  # highest over lowest line
@@ -56,6 +52,7 @@ _COHERENT = 0.9
 _RATTLE = 0.1  # of the lines played, at even ones
 _WEAK = 0.5  # of the median level
 _MARGIN = 0.05  # of the mean correlation, over the next best assignment
+_NONE, _AGAIN = "-", "r"  # replies on the terminal
 
 
 def tone(
@@ -66,7 +63,8 @@ def tone(
     frequency [Hz]: None for the usual one, or the nearest within the rig's limits. Raises
     InputError for what these do not allow.
     """
-    limits, ramp = desk.rig.limits, BURST / 4
+    limits = desk.rig.limits
+    ramp = BURST / 4
     if frequency is None:
         frequency = float(np.clip(_TONE, limits.frequency_min, limits.frequency_max))
     desk.check_frequencies(np.array([frequency]), what="--frequency")
@@ -109,53 +107,56 @@ def listen_to_outputs(
     silent input, InputError if outputs cannot be distinguished.
     """
     limits = desk.rig.limits
-    low, high = limits.frequency_min, min(limits.frequency_max, _OCTAVES * limits.frequency_min)
+    high = min(limits.frequency_max, _OCTAVES * limits.frequency_min)
     lines = np.arange(1.0, high + 1e-6, _STEP)
-    sines = Multisine(lines[lines >= low], 1, card.rate, level)
+    sines = Multisine(lines[lines >= limits.frequency_min], 1, card.rate, level)
     desk.check_times(seconds=run_time(_PERIODS), slew=sines.slew)
-    found: list[list[ResponseEstimate]] = []
+    estimates: list[list[ResponseEstimate]] = []
     for era in desk.rig.eras:
         move(era.name)
-        runs = [
-            play_on_one(card, sines, output, outputs=outputs, periods=_PERIODS)
-            for output in range(1, outputs + 1)
-        ]
+        runs = []
+        for output in range(1, outputs + 1):
+            runs.append(play_on_one(card, sines, output, outputs=outputs, periods=_PERIODS))
         check_levels(np.concatenate(runs), {beside: f"sensor next to {era.name}"})
-        found.append([estimate(sines, [run[:, [beside - 1]]]) for run in runs])
-    return _judged(desk.rig, sines.frequencies, found)
+        estimates.append([estimate(sines, [run[:, [beside - 1]]]) for run in runs])
+    return _findings(desk.rig, sines.frequencies, estimates)
 
 
-def _judged(
-    rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[ResponseEstimate]]
+def _findings(
+    rig: Rig, frequencies: FloatArray, estimates: Sequence[Sequence[ResponseEstimate]]
 ) -> list[OutputFinding]:
     """Assign outputs to actuators by the responses next to each actuator at frequencies (f,) [Hz].
 
-    found: by actuator and output. Raises InputError if outputs cannot be distinguished.
+    estimates: by actuator and output. Raises InputError if outputs cannot be distinguished.
     """
     points = np.array([[era.x, era.y] for era in rig.eras])
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
     model = free.acceleration(rig.eras, frequencies, points, loads=rig.masses).transpose(1, 0, 2)
-    values = np.array([[each.values[:, 0, 0] for each in place] for place in found])
-    noise = np.array([[each.std[:, 0] for each in place] for place in found])
-    moved = np.median(np.abs(values) / noise, axis=2).max(axis=0)  # (outputs,)
-    audible = np.flatnonzero(moved >= _MOVED)
+    values = np.array([[output.values[:, 0, 0] for output in row] for row in estimates])
+    noise = np.array([[output.std[:, 0] for output in row] for row in estimates])
+    ratios = np.median(np.abs(values) / noise, axis=2).max(axis=0)  # (outputs,)
+    audible = np.flatnonzero(ratios >= _MOVED)
     if not audible.size:
         raise InputError("no output moves the plate: check amplifier, its supply and cables")
-    values = values[:, audible].transpose(1, 2, 0)
-    rows, eras, signs = matched(values, model, frequencies)
-    levels = _size(values[rows]) / _size(model[eras])
+    responses = values[:, audible].transpose(1, 2, 0)
+    rows, eras, signs = matched(responses, model, frequencies)
+    levels = _norms(responses[rows]) / _norms(model[eras])
+    relative_levels = levels / np.median(levels)
     dead = "dead: moves nothing; check its cable and amplifier"
-    heard = [OutputFinding(n + 1, relative_level=0.0, verdict=dead) for n in range(len(moved))]
-    for row, era, sign, level in zip(rows, eras, signs, levels / np.median(levels), strict=True):
-        n = int(audible[row])
-        verdict = _verdict(found[era][n], sign=sign, level=level)
-        heard[n] = OutputFinding(n + 1, rig.eras[era].name, int(sign), float(level), verdict)
-    return heard
+    findings = []
+    for number in range(1, len(ratios) + 1):
+        findings.append(OutputFinding(number, relative_level=0.0, verdict=dead))
+    for row, era, sign, level in zip(rows, eras, signs, relative_levels, strict=True):
+        column = int(audible[row])
+        verdict = _verdict(estimates[era][column], sign=sign, level=level)
+        name = rig.eras[era].name
+        findings[column] = OutputFinding(column + 1, name, int(sign), float(level), verdict)
+    return findings
 
 
-def _verdict(beside: ResponseEstimate, *, sign: int, level: float) -> str:
-    """Return the verdict on an output that moves the plate."""
-    if beside.even[0] > _RATTLE or np.median(beside.coherence) < _COHERENT:
+def _verdict(response: ResponseEstimate, *, sign: int, level: float) -> str:
+    """Return the verdict on an output that moves the plate; response: next to its actuator."""
+    if response.even[0] > _RATTLE or np.median(response.coherence) < _COHERENT:
         return "loose: it rattles; fasten it"
     if level < _WEAK:
         return "loose, or its gain is low: fasten it, and check the amplifier's knob"
@@ -165,48 +166,52 @@ def _verdict(beside: ResponseEstimate, *, sign: int, level: float) -> str:
 def matched(
     values: ComplexArray, model: ComplexArray, frequencies: FloatArray
 ) -> tuple[IntArray, IntArray, IntArray]:
-    """Which responses (o, f, s) are which of a model's (e, f, s): numbers of both, and signs.
+    """Assign responses (o, f, s) to a model's (e, f, s): numbers of both, and signs.
 
-    Signs are relative to the majority. Raises InputError where another assignment fits nearly
-    as well.
+    Signs are relative to the majority. Raises InputError if another assignment fits nearly as well.
     """
-    one, other = _even(values), _even(model)
-    late = np.exp(2j * np.pi * np.outer(_DELAYS, frequencies))
-    alike = np.einsum("tf,ofs,efs->toe", late, one, other.conj(), optimize=True).real
-    best, rows, eras, moment = _assigned(np.abs(alike))
+    measured = _normalized(values)
+    modelled = _normalized(model)
+    delays = np.exp(2j * np.pi * np.outer(_DELAYS, frequencies))
+    similarities = np.einsum(
+        "tf,ofs,efs->toe", delays, measured, modelled.conj(), optimize=True
+    ).real
+    best, rows, eras, delay = _assigned(np.abs(similarities))
     for row, era in zip(rows, eras, strict=True):
-        without = np.abs(alike)
-        without[:, row, era] = 0
-        if best - _assigned(without)[0] < _MARGIN * len(rows):
+        without_pair = np.abs(similarities)
+        without_pair[:, row, era] = 0
+        if best - _assigned(without_pair)[0] < _MARGIN * len(rows):
             raise InputError(
                 "outputs must differ next to their actuators, got two assignments that fit nearly "
                 "equally well; check that the accelerometer was moved each time, or omit --beside "
                 "and enter which actuator moved"
             )
-    signs = np.sign(alike[moment, rows, eras])
-    return rows, eras, np.asarray(signs * (1 if signs.sum() >= 0 else -1), dtype=int)
+    signs = np.sign(similarities[delay, rows, eras])
+    majority = 1 if signs.sum() >= 0 else -1
+    return rows, eras, np.asarray(signs * majority, dtype=int)
 
 
-def _assigned(alike: FloatArray) -> tuple[float, IntArray, IntArray, int]:
-    """The best sum over a delay's assignment, its rows and columns, and the delay's number."""
-    pairs = [linear_sum_assignment(each, maximize=True) for each in alike]
-    sums = [each[pair].sum() for each, pair in zip(alike, pairs, strict=True)]
+def _assigned(similarities: FloatArray) -> tuple[float, IntArray, IntArray, int]:
+    """Return the best sum over a delay's assignment, its rows and columns, and the delay's
+    number."""
+    assignments = [linear_sum_assignment(matrix, maximize=True) for matrix in similarities]
+    sums = []
+    for matrix, assignment in zip(similarities, assignments, strict=True):
+        sums.append(matrix[assignment].sum())
     best = int(np.argmax(sums))
-    return float(sums[best]), *pairs[best], best
+    return float(sums[best]), *assignments[best], best
 
 
-def _size(values: ComplexArray) -> FloatArray:
-    """The norm of each response (n, f, s)."""
+def _norms(values: ComplexArray) -> FloatArray:
+    """Return the norm of each response (n, f, s)."""
     return np.asarray(np.linalg.norm(values, axis=(1, 2)))
 
 
-def _even(values: ComplexArray) -> ComplexArray:
+def _normalized(values: ComplexArray) -> ComplexArray:
     """Scale responses (n, f, s) so that all have one norm and all frequencies weigh the same."""
-    scaled = values / np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))[:, None]
-    return np.asarray(scaled / _size(scaled)[:, None, None])
-
-
-_NONE, _AGAIN = "-", "r"
+    power = (np.abs(values) ** 2).mean(axis=(0, 2))
+    scaled = values / np.sqrt(power)[:, None]
+    return np.asarray(scaled / _norms(scaled)[:, None, None])
 
 
 def find_outputs(
@@ -232,15 +237,17 @@ def find_outputs(
     count = count or desk.output - 1
     with closing(open_card(device, outputs=count, inputs=beside or 0, limit=level)) as card:
         if beside is None:
-            heard = _requested(desk, card, count, level=level, frequency=frequency)
+            findings = _requested(desk, card, count, level=level, frequency=frequency)
         else:
-            heard = listen_to_outputs(desk, card, beside, outputs=count, level=level, move=_moved)
-    own = {name: at - 1 for name, at in desk.eras}
-    channels = {each.era: each.output - 1 for each in heard if each.era}
-    missing = [name for name in own if name not in channels]
-    is_right = channels == own
+            findings = listen_to_outputs(
+                desk, card, beside, outputs=count, level=level, move=_prompt_to_move
+            )
+    rig_channels = {name: number - 1 for name, number in desk.eras}
+    channels = {finding.era: finding.output - 1 for finding in findings if finding.era}
+    missing = [name for name in rig_channels if name not in channels]
+    is_as_in_rig = channels == rig_channels
     files = []
-    rows = [*_rows(heard, own, channels, missing)]
+    rows = [*_rows(findings, rig_channels, channels, missing)]
     if output is not None and not missing:
         assert rig.document is not None  # noqa: S101  it was read from a file
         keys = {"eras": {name: {"channel": channel} for name, channel in channels.items()}}
@@ -248,22 +255,23 @@ def find_outputs(
         save_beside(output, rig.document, keys, comment=comment)
         files = [str(output)]
         rows.append(f"wrote {output}")
-    elif not (missing or is_right):
-        again = ["--beside", str(beside)] if beside is not None else []
+    elif not (missing or is_as_in_rig):
+        option = ["--beside", str(beside)] if beside is not None else []
         wired = rig_file.with_stem("wired")
-        rows.append(next_line("era", "outputs", rig_file, "--device", device, "-o", wired, *again))
+        rows.append(next_line("era", "outputs", rig_file, "--device", device, "-o", wired, *option))
     answer = {
-        "outputs": [asdict(each) for each in heard],
+        "outputs": [asdict(finding) for finding in findings],
         "channels": channels,
         "missing": missing,
-        "is_as_in_rig": is_right,
+        "is_as_in_rig": is_as_in_rig,
         "files": files,
     }
-    are_well = all(each.verdict == "ok" for each in heard if each.era)
-    return rows, answer, are_well and not missing and (is_right or bool(files))
+    are_well = all(finding.verdict == "ok" for finding in findings if finding.era)
+    return rows, answer, are_well and not missing and (is_as_in_rig or bool(files))
 
 
-def _moved(name: str) -> None:
+def _prompt_to_move(name: str) -> None:
+    """Wait until the accelerometer is next to an actuator."""
     typer.prompt(
         f"Put the accelerometer next to {name}, and press Enter", "", show_default=False, err=True
     )
@@ -273,45 +281,63 @@ def _requested(
     desk: Desk, card: SoundCard, count: int, *, level: float, frequency: float | None
 ) -> list[OutputFinding]:
     """Ask on the terminal which actuator each output drives."""
-    names, found = {name.lower(): name for name, _ in desk.eras}, list[OutputFinding]()
+    names = {name.lower(): name for name, _ in desk.eras}  # not assigned yet
+    findings = []
     for number in range(1, count + 1):
         played = tone(desk, number, outputs=count, rate=card.rate, level=level, frequency=frequency)
-        left = ", ".join(names.values())
-        question = f"Output {number} of {count}: which moved? {left}; {_NONE} none, {_AGAIN} again"
-        said = _AGAIN
-        while said == _AGAIN:
+        question = (
+            f"Output {number} of {count}: which moved? {', '.join(names.values())}; {_NONE} none, "
+            f"{_AGAIN} again"
+        )
+        reply = _AGAIN
+        while reply == _AGAIN:
             card.run(played)
-            while (said := typer.prompt(question, err=True).strip().lower()) not in {
-                *names, _NONE, _AGAIN
-            }:  # fmt: skip
-                typer.echo(f"{said!r} must be one of {left}; {did_you_mean(said, names)}", err=True)
-        era = names.pop(said, None)
-        found.append(OutputFinding(number, era, verdict="ok" if era else "moves nothing"))
-    return found
+            reply = _reply_to(question, names)
+        era = names.pop(reply, None)
+        findings.append(OutputFinding(number, era, verdict="ok" if era else "moves nothing"))
+    return findings
+
+
+def _reply_to(question: str, names: Mapping[str, str]) -> str:
+    """Ask on the terminal until the reply is a name, none or again; names: by lower-case name."""
+    while True:
+        reply: str = typer.prompt(question, err=True).strip().lower()
+        if reply in {*names, _NONE, _AGAIN}:
+            return reply
+        choices = ", ".join(names.values())
+        typer.echo(f"{reply!r} must be one of {choices}; {did_you_mean(reply, names)}", err=True)
 
 
 def _rows(
-    heard: Sequence[OutputFinding],
-    own: Mapping[str, int],
+    findings: Sequence[OutputFinding],
+    rig_channels: Mapping[str, int],
     channels: Mapping[str, int],
     missing: Sequence[str],
 ) -> Iterator[str]:
-    has_levels = any(each.relative_level is not None for each in heard)
+    """Yield a table of the outputs, then the channels if they differ from the rig."""
+    has_levels = any(finding.relative_level is not None for finding in findings)
     yield "output  drives      channel" + ("  polarity    level" if has_levels else "")
-    for each in heard:
-        channel, more, verdict = channels.get(each.era or ""), "", each.verdict
-        if each.polarity and each.relative_level:
-            sign = "+" if each.polarity > 0 else "-"
-            more = f"  {sign:>8s}  {20 * math.log10(each.relative_level):+5.1f} dB"
-        if each.era and channel != own[each.era]:
-            verdict = f"the rig has channel {own[each.era]}; {verdict}"
-        verdict = verdict.removesuffix("ok").removesuffix("; ")
-        drives = f"{each.output:6d}  {each.era or '-':10s} {'-' if channel is None else channel:>8}"
-        yield f"{drives}{more}  {verdict}".rstrip()
+    for finding in findings:
+        yield _row(finding, rig_channels).rstrip()
     if missing:
         yield f"on no output: {', '.join(missing)}; check cables and amplifier, or --outputs"
-    elif channels == own:
+    elif channels == rig_channels:
         yield "channels match the rig"
     else:
         yield "eras:"
         yield from (f"  {name}: {{channel: {channel}}}" for name, channel in channels.items())
+
+
+def _row(finding: OutputFinding, rig_channels: Mapping[str, int]) -> str:
+    """Format the finding for one output."""
+    era = finding.era or "-"
+    channel = str(finding.output - 1) if finding.era else "-"
+    measured = ""
+    if finding.polarity and finding.relative_level:
+        sign = "+" if finding.polarity > 0 else "-"
+        measured = f"  {sign:>8s}  {20 * math.log10(finding.relative_level):+5.1f} dB"
+    verdict = finding.verdict
+    if finding.era and finding.output - 1 != rig_channels[finding.era]:
+        verdict = f"the rig has channel {rig_channels[finding.era]}; {verdict}"
+    verdict = verdict.removesuffix("ok").removesuffix("; ")
+    return f"{finding.output:6d}  {era:10s} {channel:>8}{measured}  {verdict}"

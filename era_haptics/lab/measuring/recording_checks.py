@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.sound_card import PERIOD, Desk, Multisine, ResponseEstimate
+from era_haptics.lab.measuring.desk import Desk
+from era_haptics.lab.measuring.multisine import PERIOD, Multisine, ResponseEstimate
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 
@@ -82,8 +83,8 @@ def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
     explain the difference between the periods (a lost block does not drift).
     """
     samples = multisine.samples
-    first = np.array([multisine.found(run[:samples]) for run in runs])
-    last = np.array([multisine.found(run[-samples:]) for run in runs])
+    first = np.array([multisine.amplitudes_in(run[:samples]) for run in runs])
+    last = np.array([multisine.amplitudes_in(run[-samples:]) for run in runs])
     duration = PERIOD * (len(runs[0]) / samples - 1)
     products = last * first.conj()
     weights = np.abs(products)
@@ -254,4 +255,4 @@ def loopback_gain(
 ) -> ComplexArray:
     """Complex gain (f,) of the cable in whole periods of a run (n, inputs)."""
     amplitudes = multisine.played(number)[:, desk.looped]
-    return np.asarray(multisine.found(recorded[:, desk.input - 1]) / amplitudes)
+    return np.asarray(multisine.amplitudes_in(recorded[:, desk.input - 1]) / amplitudes)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from era_haptics.lab.measuring.sound_card import Desk, are_positions, multisine_frequencies
+from era_haptics.lab.measuring.desk import Desk, are_positions
+from era_haptics.lab.measuring.multisine import multisine_frequencies
 from model.arrays import FloatArray
 from model.estimate.measurement import Measurement, write_responses
 from model.quantities import counted

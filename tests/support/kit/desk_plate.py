@@ -31,7 +31,7 @@ import numpy as np
 from scipy import linalg, signal
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, are_positions
+from era_haptics.lab.measuring.desk import Desk, WiredSensor, are_positions
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate

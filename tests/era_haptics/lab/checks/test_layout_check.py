@@ -37,14 +37,12 @@ from controller.play.chooser import Chooser
 from controller.play.selection import Selector
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.command import run_era
-from era_haptics.lab.checks import layout_check, layout_picture
-from era_haptics.lab.checks.content_check import check_content, content_figure
-from era_haptics.lab.checks.layout_check import (
-    CheckedEffect,
-    check_layout,
-    loaded_plate,
-)
-from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs
+from era_haptics.lab.checks import joint_touches, layout_check
+from era_haptics.lab.checks.content_check import check_content
+from era_haptics.lab.checks.content_figure import content_figure
+from era_haptics.lab.checks.joint_touches import JointTouch, check_together, close_pairs
+from era_haptics.lab.checks.layout_check import CheckedEffect, check_layout
+from era_haptics.lab.checks.touch_simulator import loaded_plate
 from era_haptics.lab.cli import app
 from kit.fingers import WIRES, Pressed, playable
 from kit.fingers import table as paper_table
@@ -228,7 +226,7 @@ def test_files_that_config_init_writes_fit_each_other(
     """Each beside the rig; fingers in any two regions of the layout are promised 4 dB at once."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(layout_check, "MAX_REGION_TOUCHES", 20)
-    monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
+    monkeypatch.setattr(joint_touches, "MAX_TRIPLES", 0)
     assert run_era(["config", "init", "rig.yaml"]) == 0
     if kind != "rig":
         assert run_era(["config", "init", f"{kind}.yaml", "--kind", kind]) == 0

@@ -14,16 +14,11 @@ import pytest
 from drivers.errors import LinkError
 from era_haptics.command import run_era
 from era_haptics.lab.measuring import simulated_measurement
+from era_haptics.lab.measuring.desk import Desk, WiredSensor
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
+from era_haptics.lab.measuring.multisine import Multisine, ResponseEstimate, multisine_frequencies
 from era_haptics.lab.measuring.recording_checks import check_wiring
-from era_haptics.lab.measuring.sound_card import (
-    Desk,
-    Multisine,
-    ResponseEstimate,
-    SoundCard,
-    WiredSensor,
-    multisine_frequencies,
-)
+from era_haptics.lab.measuring.sound_card import SoundCard
 from examples.make_measured import Accelerometer, record_responses
 from kit.desk_plate import Converters, DeskModel, DeskPlate, Truth
 from model.errors import InputError
@@ -302,7 +297,7 @@ class CallbackCard(SoundCard):
         callback = kind(callback_address("transfer_portaudio"))
         block = np.ones(FRAMES, dtype=np.float32)
         out = np.zeros(FRAMES, dtype=np.float32)
-        recorded, played, given = block.ctypes.data, out.ctypes.data, self.given
+        recorded, played, given = block.ctypes.data, out.ctypes.data, self.transfer_address
         for flags in self._flags:
             assert callback(recorded, played, FRAMES, None, flags, given) == 0
         return self.transfer.gaps, bool(heard.all())

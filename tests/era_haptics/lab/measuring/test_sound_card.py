@@ -20,14 +20,10 @@ import pytest
 
 from drivers.errors import LinkError
 from era_haptics.command import run_era
+from era_haptics.lab.measuring.desk import Desk, WiredSensor, read_sensors
 from era_haptics.lab.measuring.measure import measure_through
-from era_haptics.lab.measuring.sound_card import (
-    Desk,
-    DeviceLost,
-    Multisine,
-    WiredSensor,
-    read_sensors,
-)
+from era_haptics.lab.measuring.multisine import Multisine
+from era_haptics.lab.measuring.sound_card import DeviceLost
 from kit.desk_plate import (
     Converters,
     DeskModel,

@@ -1,0 +1,84 @@
+"""Runs that play a signal and record simultaneously, repeated if blocks were lost."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.errors import LinkError
+from era_haptics.lab.measuring.desk import MIN_SETTLING
+from era_haptics.lab.measuring.multisine import PERIOD, Multisine
+from era_haptics.lab.measuring.sound_card import SoundCard
+from model.arrays import FloatArray
+
+TRIES = 3
+"""Attempts of a run."""
+
+_TAIL = 0.05  # s; longer than the ramp
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Recording of a run, (n, inputs).
+
+    is_whole: whether the last attempt lost no block; repeated: number of attempts before it.
+    """
+
+    recorded: FloatArray
+    is_whole: bool
+    repeated: int
+
+    @property
+    def whole(self) -> FloatArray:
+        """Return the recording; raises LinkError if every attempt lost blocks."""
+        if self.is_whole:
+            return self.recorded
+        raise LinkError(
+            f"blocks of sound were lost in {self.repeated + 1} attempts of a run; end other "
+            "programs, give the sound server real-time priority, or choose larger blocks"
+        )
+
+
+def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
+    """Duration of a run [s] with `periods` analyzed periods after settling."""
+    return settling + PERIOD * periods + _TAIL
+
+
+def play_and_record(
+    card: SoundCard,
+    played: FloatArray,
+    *,
+    settling: float,
+    seconds: float,
+    is_whole: Callable[[FloatArray], bool],
+    tries: int = TRIES,
+) -> Run:
+    """Play samples (n, outputs), and keep `seconds` of the recording after `settling` [s].
+
+    is_whole: checks the kept recording (n, inputs) for lost blocks; if it fails, the run is
+    repeated.
+    """
+    start, count = round(settling * card.rate), round(seconds * card.rate)
+    for repeated in range(tries):
+        kept = card.run(played)[start : start + count].astype(float)
+        if is_whole(kept):
+            return Run(kept, True, repeated)
+    return Run(kept, False, tries - 1)
+
+
+def play_on_one(
+    card: SoundCard, sines: Multisine, output: int, *, outputs: int, periods: int
+) -> FloatArray:
+    """Play a multisine on one output, counted from 1, without a loop-back.
+
+    Return whole periods of the recording (n, inputs); repeats if the device reports gaps. Raises
+    LinkError after three attempts.
+    """
+    signal = sines.signal(0, periods=run_time(periods) / PERIOD)
+    return play_and_record(
+        card,
+        signal * np.eye(outputs)[output - 1],
+        settling=MIN_SETTLING,
+        seconds=PERIOD * periods,
+        is_whole=lambda _kept: not card.gaps,
+    ).whole

@@ -56,6 +56,11 @@ DISARM_NOW = send("Disarm", ramp=0)
 SILENCE_NOW = send("Silence", ramp=0)
 
 
+def commit(token: int, code: str = "") -> Send:
+    """Build a Commit that must be carried out, or rejected with a code."""
+    return send("Commit", token=token, code=code)
+
+
 def play_now(*layers: LayerSet, now: int = 1, **values: Any) -> Send:
     """Build a set that plays immediately; values: token, session and code for `send`."""
     return send("Set", layers=layers, now=now, **values)

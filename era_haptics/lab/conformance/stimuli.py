@@ -100,6 +100,11 @@ class Stimuli:
         """Return whether the amplifier states a feature; empty: a feature of all amplifiers."""
         return not feature or has_feature(self.can, feature)
 
+    @property
+    def ramp_max(self) -> int:
+        """The longest ramp [ms]."""
+        return int(self.can["ramp_max"])
+
     def require(self, feature: str) -> None:
         """Raise NotApplicable unless it states a feature."""
         require(self.has(feature), f"the feature {feature} is not stated")
@@ -135,6 +140,10 @@ class Stimuli:
     def separate_tone(self, number: int, fraction: float) -> Command:
         """Build a tone on channel 0 that does not interfere with the tones of other layers."""
         return self.tone(0, fraction, frequency=self.separate_frequency(number))
+
+    def separate_layer(self, number: int, fraction: float) -> LayerSet:
+        """Build a layer with a tone that does not interfere with the tones of other layers."""
+        return layer(number, self.separate_tone(number, fraction))
 
     def layer_0(
         self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0

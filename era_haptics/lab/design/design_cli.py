@@ -1,6 +1,5 @@
 """`era design`: optimize or rank ERA positions by promised felt contrast."""
 
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +14,7 @@ from model.commands.options import (
     LowestOption,
     MeshOption,
     RigArgument,
+    Stopwatch,
     next_line,
     print_report,
     progress_bar,
@@ -26,6 +26,9 @@ from registry.limits import MAX_CONTENTS
 
 if TYPE_CHECKING:
     from era_haptics.lab.design.design_files import UnfinishedDesign
+
+LIGHT = 0.2
+"""Fraction of the ERAs' mean load below which the plate can tip when a finger presses elsewhere."""
 
 design_app = typer.Typer()
 
@@ -112,13 +115,12 @@ def design(
     rig = rig_of(document, mesh=mesh)
     counts = _counts(eras) if eras else None
     distance = _quantity(apart, LENGTH, "--apart")
-    springs = [_quantity(each, STIFFNESS, "--stiffness") for each in _listed(stiffness)]
+    springs = [_quantity(text, STIFFNESS, "--stiffness") for text in _listed(stiffness)]
     output.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
     unfinished = UnfinishedDesign()
     try:
-        with progress_bar("tasks") as progress:
-            found = find(
+        with Stopwatch() as stopwatch, progress_bar("tasks") as progress:
+            designed = find(
                 rig,
                 counts,
                 layouts=layouts or None,
@@ -140,8 +142,8 @@ def design(
     except KeyboardInterrupt:
         _report_unfinished(unfinished, rig_file, output, as_json=as_json)
         raise
-    files = [str(path) for path in write_design(output, found, document.data)]
-    result = {**design_summary(found), "time_s": time.perf_counter() - started, "files": files}
+    files = [str(path) for path in write_design(output, designed, document.data)]
+    result = {**design_summary(designed), "time_s": stopwatch.elapsed, "files": files}
     _warn_of_light(result["eras"])
     table = output / "table.npz"
     rows = [
@@ -164,8 +166,8 @@ def _report_unfinished(
         file = output / "unfinished.yaml"
         unfinished.write(file)
         files = [str(file)]
-        found = f"{result['layout_count']} layouts were found so far"
-        counts = f"{found}, {result['judged']} evaluated in full"
+        layouts = f"{result['layout_count']} layouts were found so far"
+        counts = f"{layouts}, {result['judged']} evaluated in full"
         rows = [
             f"interrupted: this design is incomplete; {counts}",
             *_rows_of_layouts(result["layouts"]),
@@ -191,7 +193,7 @@ def _counts(text: str) -> Sequence[int]:
 
 def _listed(text: str) -> list[str]:
     """Split a comma-separated list."""
-    return [each.strip() for each in text.split(",") if each.strip()]
+    return [item.strip() for item in text.split(",") if item.strip()]
 
 
 def _quantity(text: str, dimension: Dimension, option: str) -> float:
@@ -202,17 +204,14 @@ def _quantity(text: str, dimension: Dimension, option: str) -> float:
         raise InputError(f"{option} {error}") from None
 
 
-LIGHT = 0.2
-"""Fraction of the ERAs' mean load below which the plate can tip when a finger presses elsewhere."""
-
-
 def _warn_of_light(eras: dict[str, dict[str, Any]]) -> None:
     """Warn of ERAs that carry so little weight that the plate nearly tips."""
     loads = {name: era["static_load_n"] for name, era in eras.items()}
-    least = LIGHT * sum(loads.values()) / len(loads)
-    if light := [f"{name} ({load:.2f} N)" for name, load in loads.items() if load < least]:
+    min_load = LIGHT * sum(loads.values()) / len(loads)
+    light = [f"{name} ({load:.2f} N)" for name, load in loads.items() if load < min_load]
+    if light:
         typer.echo(
-            f"era: warning: {', '.join(light)}: carries less than {least:.2f} N of the plate's "
+            f"era: warning: {', '.join(light)}: carries less than {min_load:.2f} N of the plate's "
             "weight, a fifth of the mean; a finger can lift the plate off: fasten it there, or "
             "exclude these positions with --where",
             err=True,
@@ -222,27 +221,20 @@ def _warn_of_light(eras: dict[str, dict[str, Any]]) -> None:
 def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
     """Yield positions, contrast, starts, and the gain per ERA; own_count: number of ERAs of the
     rig."""
-    own = f"the rig's own {counted(own_count, 'ERA')}"
     yield f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s"
     yield "name      x / mm   y / mm   dB per mm   load / N"
     for name, era in result["eras"].items():
-        x, y = (1000 * each for each in era["at_m"])
+        x, y = era["at_m"]
         yield (
-            f"{name:8s} {x:7.1f}  {y:7.1f}   {era['sensitivity_db_per_mm']:9.3f}   "
+            f"{name:8s} {1000 * x:7.1f}  {1000 * y:7.1f}   {era['sensitivity_db_per_mm']:9.3f}   "
             f"{era['static_load_n']:8.2f}"
         )
     if result["contents"] > 1:
         yield f"{result['contents']} simultaneous vibrations, contrast of the worst finger:"
-    for title, key in (("this layout", "contrast_db"), (own, "own_contrast_db")):
-        if result[key] is not None:
-            medians = " / ".join(
-                f"{value:.1f}" for name, value in result[key].items() if name != "mean"
-            )
-            quiet = " / ".join(name.split("_")[1] for name in result[key] if name != "mean")
-            yield (
-                f"{title}: mean {result[key]['mean']:.1f} dB, median {medians} dB with {quiet} "
-                "quiet fingers"
-            )
+    yield _contrast_row("this layout", result["contrast_db"])
+    if result["own_contrast_db"] is not None:
+        own_layout = f"the rig's own {counted(own_count, 'ERA')}"
+        yield _contrast_row(own_layout, result["own_contrast_db"])
     reached = f"level reached in {100 * result['reached_share']:.0f} % of {result['sets']} sets"
     if result["starts_db"]:
         starts = len(result["starts_db"])
@@ -257,6 +249,15 @@ def _rows(result: dict[str, Any], *, own_count: int) -> Iterator[str]:
     counts = list(result["by_count_db"].items())
     yield "ERAs      " + "  ".join(f"{count:>5s}" for count, _ in counts)
     yield "mean / dB " + "  ".join(f"{value:5.1f}" for _, value in counts)
+
+
+def _contrast_row(title: str, contrasts: dict[str, float]) -> str:
+    """Format the mean contrast, and the median for each number of quiet fingers."""
+    medians = dict(contrasts)
+    mean = medians.pop("mean")
+    values = " / ".join(f"{value:.1f}" for value in medians.values())
+    counts = " / ".join(name.split("_")[1] for name in medians)
+    return f"{title}: mean {mean:.1f} dB, median {values} dB with {counts} quiet fingers"
 
 
 def _rows_of_layouts(layouts: list[dict[str, Any]]) -> Iterator[str]:

@@ -24,6 +24,7 @@ from era_haptics.lab.conformance.request_rows import (
     SILENCE_NOW,
     STOP_NOW,
     RequestRows,
+    commit,
     send,
 )
 from era_haptics.lab.conformance.subject import RATE_STEP, Subject
@@ -145,7 +146,7 @@ async def _expect_rate(subject: Subject, duration: float) -> None:
     while threads.now() < end:
         row = send("GetStatus")
         if subject.is_hungry:  # a Commit feeds, and leaves the rate as it is
-            row = send("Commit", token=subject.token)
+            row = commit(subject.token)
         await subject.run([row])
         await asyncio.sleep(_SPACING / 2)
     await subject.request("GetStatus")

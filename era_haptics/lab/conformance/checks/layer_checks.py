@@ -11,6 +11,7 @@ from era_haptics.lab.conformance.request_rows import (
     SILENCE_NOW,
     RequestRows,
     Row,
+    commit,
     layer,
     play_now,
     send,
@@ -32,7 +33,7 @@ def layers_add(subject: Subject) -> RequestRows:
     last = len(subject.layers) - 1
     playing = []
     for number in reversed(subject.layers):
-        playing.append(layer(number, subject.separate_tone(number, share)))
+        playing.append(subject.separate_layer(number, share))
     silent = [layer(number) for number in subject.layers[:-1]]
     exchange = play_now(playing[-1], layer(last))
     return [subject.arm, *playing, *silent, exchange]
@@ -46,8 +47,8 @@ def layers_play_on(subject: Subject) -> RequestRows:
     """
     ramp = subject.ramp
     first = subject.layer_0(level=0.75, ramp=ramp, valid_for=ramp + 100)
-    loud = layer(1, subject.separate_tone(1, 0.25))
-    quiet = layer(1, subject.separate_tone(1, 0.125))
+    loud = subject.separate_layer(1, 0.25)
+    quiet = subject.separate_layer(1, 0.125)
     return [(first, 0.02, loud, quiet, loud)]
 
 
@@ -58,13 +59,13 @@ def valid_for(subject: Subject) -> RequestRows:
     Count valid_for in real time from the start of the layer, as 16-bit milliseconds;
     0 is no end.
     """
-    ramp = min(100, subject.can["ramp_max"])
+    ramp = min(100, subject.ramp_max)
     short = subject.scaled(100)
     pause = 0.12 * subject.slowness
     half = subject.layer_0(level=0.5, valid_for=short)
     endless_half = subject.layer_0(level=0.5)
     lasting = layer(1, subject.separate_tone(1, 0.25), valid_for=60_000)
-    endless = layer(2, subject.separate_tone(2, 0.25))
+    endless = subject.separate_layer(2, 0.25)
     return [
         [subject.layer_0(valid_for=1)],
         [subject.layer_0(valid_for=short)],
@@ -90,7 +91,7 @@ def renew(subject: Subject) -> RequestRows:
     scaled = subject.scaled
     fading = subject.layer_0(level=0.5, ramp=40, valid_for=scaled(200))
     turned = subject.layer_0(subject.tone(0, 0.5, 90.0), valid_for=scaled(400))
-    second = layer(1, subject.separate_tone(1, 0.25))
+    second = subject.separate_layer(1, 0.25)
     timed = layer(3, subject.separate_tone(3, 0.25), valid_for=scaled(120))
     earlier_end = layer(0, renew=True, valid_for=scaled(100))
     return [
@@ -114,7 +115,7 @@ def after(subject: Subject) -> RequestRows:
     waiting_tone = subject.tone(0, 0.25, frequency=subject.second_frequency)
     waiting = layer(0, waiting_tone, after=True)
     replaced = layer(0, subject.tone(0, 0.75), after=True)
-    other_layer = layer(1, subject.separate_tone(1, 0.25))
+    other_layer = subject.separate_layer(1, 0.25)
     arm_again = send("Arm", watchdog=subject.can["watchdog_max"])
     onset_end = _until_onset_end(subject, 3)
     return [
@@ -124,8 +125,8 @@ def after(subject: Subject) -> RequestRows:
         (rising, waiting, subject.layer_0(level=0.75), onset_end),
         (rising, waiting, SILENCE_NOW, onset_end),
         # Only one layer of a set waits.
-        (rising, stage(waiting, other_layer), send("Commit", token=2)),
-        (rising, stage(other_layer, waiting), send("Commit", token=2)),
+        (rising, stage(waiting, other_layer), commit(2)),
+        (rising, stage(other_layer, waiting), commit(2)),
     ]
 
 

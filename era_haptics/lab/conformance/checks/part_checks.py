@@ -15,6 +15,7 @@ from era_haptics.lab.conformance.request_rows import (
     RequestRows,
     Row,
     Send,
+    commit,
     layer,
     play_now,
     send,
@@ -97,35 +98,31 @@ def parts_of_sets(subject: Subject) -> RequestRows:
     """
     _require_quick(subject)
     layers = long_set(subject)
+    playing = subject.layer_0()
     silent_layers = [layer(number) for number in subject.layers[1:]]
+    rows: list[Row] = [subject.arm, playing]
+    rows += _staged_in_any_order(_cut(subject, *layers, token=2))
+    rows += [play_now(playing, *silent_layers, token=3), 0.05]
+    rows += _played_in_any_order(_cut(subject, *layers, token=4, now=1))
     together = _cut(subject, *layers, token=6)
-    return [
-        subject.arm,
-        subject.layer_0(),
-        *_staged_in_any_order(_cut(subject, *layers, token=2)),
-        play_now(subject.layer_0(), *silent_layers, token=3),
-        0.05,
-        *_played_in_any_order(_cut(subject, *layers, token=4, now=1)),
-        # Back to back; only the last part decides whether the set plays immediately.
-        play_now(subject.layer_0(), token=5),
-        partial(subject.send_all, together),
-        send("Commit", token=6),
-        *(_with(part, token=7, now=1) for part in together[:-1]),
-        _with(together[-1], token=7),
-        _with(together[-1], token=7, now=1),
-    ]
+    rows += [play_now(playing, token=5), partial(subject.send_all, together), commit(6)]
+    # Only the last part decides whether the set plays immediately.
+    *middle, last = together
+    rows += [_with(part, token=7, now=1) for part in middle]
+    rows += [_with(last, token=7), _with(last, token=7, now=1)]
+    return rows
 
 
 def _staged_in_any_order(set_parts: Sequence[Send]) -> list[Row]:
     """Return the parts of a set that is staged, the last one first, and repetitions."""
     first, *middle, last = set_parts
     token = first.values["token"]
-    incomplete = send("Commit", token=token, code="INCOMPLETE")
+    incomplete = commit(token, "INCOMPLETE")
     rows: list[Row] = [last]
     for part in (*reversed(middle), middle[-1]):
         rows += [part, incomplete, last]
     rows += [first, incomplete, last, last]
-    rows += [first, middle[0], last, send("Commit", token=token), last, 0.05]
+    rows += [first, middle[0], last, commit(token), last, 0.05]
     return rows
 
 
@@ -153,26 +150,12 @@ def parts_that_are_dropped(subject: Subject) -> RequestRows:
     ]
     dropped = [_with(second, **values) for values in dropped_values]
     drop_all = partial(subject.send_all, dropped)
-    return [
-        subject.arm,
-        play_now(subject.layer_0(), token=5),
-        last,
-        first,
-        drop_all,
-        *_parts_without_a_name(subject, second),
-        partial(subject.send_all, _wrong_last_parts(last, count)),
-        _with(last, token=5),
-        last,
-        *middle,
-        second,
-        last,
-        drop_all,
-        send("Commit", token=9),
-        DISARM_NOW,
-        subject.settle,
-        first,
-        _with(last, code="WRONG_STATE"),
-    ]
+    wrong_last_parts = partial(subject.send_all, _wrong_last_parts(last, count))
+    rows: list[Row] = [subject.arm, play_now(subject.layer_0(), token=5), last, first, drop_all]
+    rows += [*_parts_without_a_name(subject, second), wrong_last_parts]
+    rows += [_with(last, token=5), last, *middle, second, last, drop_all, commit(9)]
+    rows += [DISARM_NOW, subject.settle, first, _with(last, code="WRONG_STATE")]
+    return rows
 
 
 def _parts_without_a_name(subject: Subject, part: Send) -> list[Row]:
@@ -212,20 +195,12 @@ def parts_again(subject: Subject) -> RequestRows:
     _require_quick(subject)
     first, *middle, last = _cut(subject, *long_set(subject), token=2)
     nonsense = [0xFFFF] * 3
-    return [
-        subject.arm,
-        subject.layer_0(),
-        _with(first, stream=nonsense),
-        *middle,
-        first,
-        last,
-        _with(first, stream=nonsense),
-        _with(last, stream=nonsense),
-        last,
-        send("Commit", token=2),
-        _with(last, stream=nonsense, now=1),
-        _with(last, index=0),
-    ]
+    wrong_first = _with(first, stream=nonsense)
+    wrong_last = _with(last, stream=nonsense)
+    rows: list[Row] = [subject.arm, subject.layer_0(), wrong_first, *middle, first, last]
+    rows += [wrong_first, wrong_last, last, commit(2)]
+    rows += [_with(last, stream=nonsense, now=1), _with(last, index=0)]
+    return rows
 
 
 @driving("protocol.md#parts-of-a-set")
@@ -241,30 +216,15 @@ def refused_parts(subject: Subject) -> RequestRows:
     first, *middle, last = _cut(subject, half, flawed, token=2)
     *valid_parts, valid_last = _cut(subject, *long_set(subject), token=5)
     rejected = partial(replace, codes=("BAD_CHANNEL",), channels=(0,))
-    return [
-        subject.arm,
-        quarter,
-        first,
-        *middle,
-        rejected(last),
-        last,
-        stage(half, token=3),
-        rejected(play_now(flawed, token=4)),
-        rejected(stage(flawed, token=4)),
-        # The last part of an incomplete newer set changes nothing; a part that is kept does.
-        valid_last,
-        send("Commit", token=3),
-        stage(quarter, token=4),
-        *valid_parts,
-        stage(quarter, token=4, code="BAD_TOKEN"),
-        send("Commit", token=4, code="BAD_TOKEN"),
-        rejected(stage(flawed, token=6)),
-        valid_last,
-        send("Commit", token=5),
-        stage(half, token=6),
-        play_now(quarter, token=7),
-        send("Commit", token=6, code="BAD_TOKEN"),
-    ]
+    rows: list[Row] = [subject.arm, quarter, first, *middle, rejected(last), last]
+    rows += [stage(half, token=3), rejected(play_now(flawed, token=4))]
+    rows.append(rejected(stage(flawed, token=4)))
+    # The last part of an incomplete newer set changes nothing; a part that is kept does.
+    rows += [valid_last, commit(3), stage(quarter, token=4), *valid_parts]
+    rows += [stage(quarter, token=4, code="BAD_TOKEN"), commit(4, "BAD_TOKEN")]
+    rows += [rejected(stage(flawed, token=6)), valid_last, commit(5)]
+    rows += [stage(half, token=6), play_now(quarter, token=7), commit(6, "BAD_TOKEN")]
+    return rows
 
 
 @driving("protocol.md#sets")
@@ -281,19 +241,14 @@ def empty_sets(subject: Subject) -> RequestRows:
     is_on_modbus = subject.client.transactions > 1
     count = _MANY_ON_MODBUS if is_on_modbus else _MANY
     many_parts = [empty_part(token=5, index=index, parts=count) for index in range(count)]
-    return [
-        subject.arm,
-        playing,
-        empty_set,
-        send("Commit", token=2),
-        _with(empty_set, token=3, now=1),
-        0.1,
-        empty_part(index=0, parts=4),
-        _with(part, index=1, parts=4, stream=pack_layers([half])),
-        empty_part(index=2, parts=4),
-        _with(last, index=3, parts=4, stream=[], now=1),
-        partial(subject.send_all, many_parts),
-    ]
+    rows: list[Row] = [subject.arm, playing, empty_set, commit(2)]
+    rows += [_with(empty_set, token=3, now=1), 0.1]
+    rows.append(empty_part(index=0, parts=4))
+    rows.append(_with(part, index=1, parts=4, stream=pack_layers([half])))
+    rows.append(empty_part(index=2, parts=4))
+    rows.append(_with(last, index=3, parts=4, stream=[], now=1))
+    rows.append(partial(subject.send_all, many_parts))
+    return rows
 
 
 @driving("protocol.md#sets")
@@ -303,7 +258,7 @@ def max_set(subject: Subject) -> RequestRows:
     Provide memory for the set_words that you state, and check the length before the contents.
     """
     room = min(subject.can["set_words"], _MAX_TRIED)
-    rows: list[Row] = [subject.arm, stage(*_set_of(subject, room)), send("Commit", token=1)]
+    rows: list[Row] = [subject.arm, stage(*_set_of(subject, room)), commit(1)]
     first, *others = _set_of(subject, room + 2)
     is_longer = len(pack_layers([first, *others])) > subject.can["set_words"]
     if is_longer:
@@ -345,23 +300,9 @@ def sets_expire(subject: Subject) -> RequestRows:
     first, *middle, last = _cut(subject, *long_set(subject), token=3)
     pause = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1)
     expiring = ExpiringSet(subject)
-    return [
-        subject.arm,
-        subject.layer_0(),
-        partial(expiring.start, first),
-        pause,
-        *middle,
-        # Another confirmation does not extend the life of a set.
-        last,
-        pause,
-        last,
-        expiring.outlive,
-        send("Commit", token=3, code="BAD_TOKEN"),
-        last,
-        partial(expiring.start, middle[0]),
-        *middle[1:],
-        0.55 * STAGED_LIFE,
-        first,
-        expiring.outlive,
-        last,
-    ]
+    rows: list[Row] = [subject.arm, subject.layer_0(), partial(expiring.start, first), pause]
+    # Another confirmation does not extend the life of a set.
+    rows += [*middle, last, pause, last, expiring.outlive, commit(3, "BAD_TOKEN"), last]
+    rows += [partial(expiring.start, middle[0]), *middle[1:]]
+    rows += [0.55 * STAGED_LIFE, first, expiring.outlive, last]
+    return rows

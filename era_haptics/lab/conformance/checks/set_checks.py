@@ -16,6 +16,7 @@ from era_haptics.lab.conformance.request_rows import (
     RequestRows,
     Row,
     Send,
+    commit,
     layer,
     play_now,
     send,
@@ -145,7 +146,7 @@ def accepts_its_ranges(subject: Subject) -> RequestRows:
     Treat limits as inclusive, and check the frequency only of commands that drive.
     """
     rows: list[Row] = [subject.arm]
-    ramp_max = subject.can["ramp_max"]
+    ramp_max = subject.ramp_max
     for channel, limits in enumerate(subject.can["limits"]):
         for name in ("frequency_min", "frequency_max"):
             tone = Command(channel, limits[name], limits["level_max"], _PHASE.minimum)
@@ -182,7 +183,7 @@ def all_or_nothing(subject: Subject) -> RequestRows:
         values = {**flawed.values, "token": token, "now": token % 2}
         rejected_rows.append(replace(flawed, values=values))
         if token % _BATCH == 0:
-            rejected_rows.append(send("Commit", token=token, code="BAD_TOKEN"))
+            rejected_rows.append(commit(token, "BAD_TOKEN"))
     batches = in_batches(rejected_rows, _BATCH)
     next_token = len(rejected_rows) + 2
     silent = pack_layers([layer(0)])
@@ -194,7 +195,7 @@ def all_or_nothing(subject: Subject) -> RequestRows:
         stage(subject.layer_0(level=0.25)),
         _rejected(silent, "BAD_TOKEN", token=next_token - 1, now=1),
         send("Set", raw=[subject.next_session, 0, 1 << 1, *silent], code="BAD_TOKEN"),
-        send("Commit", token=next_token + 1),
+        commit(next_token + 1),
     ]
 
 
@@ -268,7 +269,7 @@ def _sets_of_flawed_layers(subject: Subject) -> Iterator[Send]:
     for flawed in flawed_layers:
         yield _rejected(pack_layers([valid, flawed]))
         yield _rejected(pack_layers([flawed, valid]))
-    too_long = {"ramp": subject.can["ramp_max"] + 1, "valid_for": _MAX_VALID_FOR + 1}
+    too_long = {"ramp": subject.ramp_max + 1, "valid_for": _MAX_VALID_FOR + 1}
     start = len(pack_layers([valid]))
     for flawed in (layer(0, tone, tone), layer(0), layer(0, renew=True)):
         for name, time in too_long.items():

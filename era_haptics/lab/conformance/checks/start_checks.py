@@ -26,6 +26,7 @@ from era_haptics.lab.conformance.request_rows import (
     STOP_NOW,
     RequestRows,
     Row,
+    commit,
     layer,
     play_now,
     send,
@@ -52,27 +53,16 @@ def stage_and_commit(subject: Subject) -> RequestRows:
     Compare all 16 bits of the token. Confirm the token committed last, and reject every token that
     is not staged.
     """
-    layers = [
-        layer(0, subject.tone(0, 0.5), ramp=50),
-        layer(1, subject.separate_tone(1, 0.25)),
-    ]
-    repetitions = [send("Commit", token=2), stage(*layers, token=2), play_now(*layers, token=2)]
-    other_tokens = (3, 302, 2 ^ 0x100, 0)
-    return [
-        subject.arm,
-        send("Commit", token=0, code="BAD_TOKEN"),
-        subject.layer_0(),
-        stage(*layers),
-        *(send("Commit", token=token, code="BAD_TOKEN") for token in other_tokens),
-        send("Commit", token=2),
-        subject.follow,
-        *repetitions,
-        *repetitions,
-        stage(subject.layer_0(level=0.75), token=3),
-        send("Commit", token=2),
-        send("Commit", token=3),
-        play_now(subject.layer_0(), token=2, code="BAD_TOKEN"),
-    ]
+    playing = subject.layer_0()
+    layers = [layer(0, subject.tone(0, 0.5), ramp=50), subject.separate_layer(1, 0.25)]
+    repetitions = [commit(2), stage(*layers, token=2), play_now(*layers, token=2)]
+    rows: list[Row] = [subject.arm, commit(0, "BAD_TOKEN"), playing, stage(*layers)]
+    for other_token in (3, 302, 2 ^ 0x100, 0):
+        rows.append(commit(other_token, "BAD_TOKEN"))
+    rows += [commit(2), subject.follow, *repetitions, *repetitions]
+    rows += [stage(subject.layer_0(level=0.75), token=3), commit(2), commit(3)]
+    rows.append(play_now(playing, token=2, code="BAD_TOKEN"))
+    return rows
 
 
 @driving("protocol.md#start-of-a-set")
@@ -83,9 +73,8 @@ def repeats_change_nothing(subject: Subject) -> RequestRows:
     over.
     """
     timed = subject.layer_0(valid_for=300)
-    commit = send("Commit", token=1)
-    repetitions = [commit, play_now(timed, token=1)]
-    return [subject.arm, stage(timed), commit, 0.2, *repetitions, 0.13, *repetitions]
+    repetitions = [commit(1), play_now(timed, token=1)]
+    return [subject.arm, stage(timed), commit(1), 0.2, *repetitions, 0.13, *repetitions]
 
 
 @driving("protocol.md#sets")
@@ -111,28 +100,15 @@ def newer_sets_replace(subject: Subject) -> RequestRows:
     Keep one staged set. Drop it when a newer set is staged or played and when the amplifier falls
     silent.
     """
+    loud = subject.layer_0()
     half = subject.layer_0(level=0.5)
     quarter = subject.layer_0(level=0.25)
-    dropped = partial(send, "Commit", code="BAD_TOKEN")
-    return [
-        subject.arm,
-        stage(quarter),
-        stage(half),
-        dropped(token=1),
-        stage(subject.layer_0(), token=1, code="BAD_TOKEN"),
-        send("Commit", token=2),
-        stage(subject.layer_0()),
-        half,
-        dropped(token=3),
-        stage(subject.layer_0()),
-        SILENCE_NOW,
-        dropped(token=5),
-        stage(subject.layer_0()),
-        DISARM_NOW,
-        subject.settle,
-        subject.arm,
-        dropped(token=6),
-    ]
+    rows: list[Row] = [subject.arm, stage(quarter), stage(half), commit(1, "BAD_TOKEN")]
+    rows += [stage(loud, token=1, code="BAD_TOKEN"), commit(2)]
+    rows += [stage(loud), half, commit(3, "BAD_TOKEN")]
+    rows += [stage(loud), SILENCE_NOW, commit(5, "BAD_TOKEN")]
+    rows += [stage(loud), DISARM_NOW, subject.settle, subject.arm, commit(6, "BAD_TOKEN")]
+    return rows
 
 
 @driving("protocol.md#start-of-a-set")
@@ -146,7 +122,7 @@ def committed_together(subject: Subject) -> RequestRows:
     layer_words = LAYER.words + COMMAND.words * len(tones)
     room = subject.can["set_words"] // layer_words
     layers = [layer(number, *tones, ramp=subject.ramp) for number in subject.layers[:room]]
-    return [[stage(*layers), send("Commit", token=1)]]
+    return [[stage(*layers), commit(1)]]
 
 
 @driving("protocol.md#start-of-a-set")
@@ -176,7 +152,7 @@ async def _expect_start(subject: Subject, duration: float, *, shift: int = 0) ->
     moment = await subject.commit_in(duration)
     committed_at = threads.now()
     await subject.request("Ping", rate=_SLOWEST if is_long else 0)
-    await subject.run([play_now(content, token=1), send("Commit", token=1)])
+    await subject.run([play_now(content, token=1), commit(1)])
     starts_at = committed_at + (duration if is_ahead else 0.0)
     await subject.pause(max(starts_at - _AROUND - threads.now(), 0.0))
     has_clock = subject.can["clock_error"] != CLOCK_UNKNOWN
@@ -233,7 +209,7 @@ def what_waits_for_its_moment(subject: Subject) -> RequestRows:
 
 def _rows_before_the_moment(subject: Subject, lead: float) -> list[list[Row]]:
     """Return rows that start a waiting set, drop it or leave it; lead: until its moment [s]."""
-    half = layer(1, subject.separate_tone(1, 0.5))
+    half = subject.separate_layer(1, 0.5)
     same_layer = subject.layer_0(level=0.5)
     part, *_ = subject.parts(half, token=2, now=0, count=3)
     rejected_set = play_now(layer(0, after=True), token=3, code="BAD_VALUE")
@@ -245,8 +221,8 @@ def _rows_before_the_moment(subject: Subject, lead: float) -> list[list[Row]]:
         [play_now(half)],
         [play_now(same_layer)],
         # It starts before the next set for its own layer.
-        [stage(same_layer), send("Commit", token=2)],
+        [stage(same_layer), commit(2)],
         [send("Set", **part)],
         [stage(half), partial(subject.commit_in, lead / 2)],
-        [stage(half), send("Commit", token=3, code="BAD_TOKEN"), rejected_set],
+        [stage(half), commit(3, "BAD_TOKEN"), rejected_set],
     ]

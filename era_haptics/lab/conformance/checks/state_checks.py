@@ -11,6 +11,7 @@ from era_haptics.lab.conformance.request_rows import (
     STOP_NOW,
     RequestRows,
     Row,
+    commit,
     layer,
     play_now,
     send,
@@ -36,14 +37,13 @@ def _rows_while_disarmed(subject: Subject, ramp: int = 0) -> list[Row]:
     """Return requests that an unarmed amplifier rejects or ignores; ramp of the Disarm [ms]."""
     loud = subject.layer_0(level=0.75)
     # The state is checked before the capabilities and before repeated layers.
-    return [
+    rows: list[Row] = [
         play_now(loud, token=9, code="WRONG_STATE"),
         stage(loud, loud, token=9, code="WRONG_STATE"),
-        send("Commit", token=1, code="WRONG_STATE"),
+        commit(1, "WRONG_STATE"),
         send("Silence", ramp=_MAX_RAMP, code="WRONG_STATE"),
-        send("Ping", session=77),
-        send("Disarm", ramp=ramp),
     ]
+    return [*rows, send("Ping", session=77), send("Disarm", ramp=ramp)]
 
 
 def rows_while_latched(subject: Subject) -> list[Row]:
@@ -63,17 +63,12 @@ def arming(subject: Subject) -> RequestRows:
 
     In Arm, drop collected and staged sets and reset the committed token to 0.
     """
-    return [
-        subject.arm,
-        play_now(subject.layer_0(), token=40_000),
-        stage(subject.layer_0(), token=40_001),
-        DISARM_NOW,
-        subject.settle,
-        subject.arm,
-        send("Commit", token=40_001, code="BAD_TOKEN"),
-        # Older than 40 000, but the first of this session.
-        play_now(subject.layer_0(), token=39_999),
-    ]
+    playing = subject.layer_0()
+    rows: list[Row] = [subject.arm, play_now(playing, token=40_000), stage(playing, token=40_001)]
+    rows += [DISARM_NOW, subject.settle, subject.arm, commit(40_001, "BAD_TOKEN")]
+    # Older than 40 000, but the first of this session.
+    rows.append(play_now(playing, token=39_999))
+    return rows
 
 
 @driving("protocol.md#states")
@@ -90,7 +85,7 @@ def arms_again(subject: Subject) -> RequestRows:
         stage(subject.layer_0(level=0.5)),
         send("Arm", watchdog=subject.shortest_watchdog),
         send("Arm", watchdog=watchdog_max),
-        send("Commit", token=2),
+        commit(2),
     ]
 
 
@@ -103,26 +98,20 @@ def sessions(subject: Subject) -> RequestRows:
     """
     subject.client.session = _SESSION - 1
     watchdog_max = subject.can["watchdog_max"]
+    playing = subject.layer_0()
     quiet = subject.layer_0(level=0.25)
-    other_sessions = (0x1235, 0x5634, 0x1256, 0xEDCB, 1)
-    return [
-        subject.arm,
-        subject.layer_0(),
-        stage(subject.layer_0()),
-        *(partial(_expect_wrong_session, subject, session) for session in other_sessions),
-        send("Ping", session=0, code="BAD_VALUE"),
-        DISARM_NOW,
-        subject.settle,
-        play_now(quiet, session=0x1235, code="WRONG_STATE"),
-        send("Arm", watchdog=watchdog_max, session=_SESSION, code="WRONG_SESSION"),
-        partial(_arm_as, subject, _SESSION ^ 0x100),
-        play_now(quiet, session=_SESSION, code="WRONG_SESSION"),
-        STOP_NOW,
-        subject.settle,
-        subject.clear,
-        send("Arm", watchdog=watchdog_max, code="WRONG_SESSION"),
-        partial(_arm_as, subject, _SESSION - 7),
-    ]
+    arm_again = send("Arm", watchdog=watchdog_max, session=_SESSION, code="WRONG_SESSION")
+    arm_after_stop = send("Arm", watchdog=watchdog_max, code="WRONG_SESSION")
+    rows: list[Row] = [subject.arm, playing, stage(playing)]
+    for other_session in (0x1235, 0x5634, 0x1256, 0xEDCB, 1):
+        rows.append(partial(_expect_wrong_session, subject, other_session))
+    rows += [send("Ping", session=0, code="BAD_VALUE"), DISARM_NOW, subject.settle]
+    rows += [play_now(quiet, session=0x1235, code="WRONG_STATE"), arm_again]
+    rows.append(partial(_arm_as, subject, _SESSION ^ 0x100))
+    rows.append(play_now(quiet, session=_SESSION, code="WRONG_SESSION"))
+    rows += [STOP_NOW, subject.settle, subject.clear, arm_after_stop]
+    rows.append(partial(_arm_as, subject, _SESSION - 7))
+    return rows
 
 
 async def _expect_wrong_session(subject: Subject, session: int) -> None:
@@ -157,7 +146,7 @@ def arming_ends_fades(subject: Subject) -> RequestRows:
     return [
         subject.arm,
         subject.layer_0(),
-        send("Disarm", ramp=subject.can["ramp_max"]),
+        send("Disarm", ramp=subject.ramp_max),
         ended_session,
         subject.arm,
         partial(subject.follow, 0.02),
@@ -172,16 +161,10 @@ def stop(subject: Subject) -> RequestRows:
     Remove every voice, drop collected, staged and waiting sets, enter QUICK_STOP_ACTIVE with a new
     latch, and answer WRONG_STATE to Arm, Set, Commit and Silence.
     """
-    return [
-        subject.arm,
-        subject.all_channels(),
-        stage(subject.layer_0(level=0.5)),
-        STOP_NOW,
-        0.02,
-        *rows_while_latched(subject),
-        send("Commit", token=2, code="WRONG_STATE"),
-        0.1,
-    ]
+    staged = stage(subject.layer_0(level=0.5))
+    before_stop: list[Row] = [subject.arm, subject.all_channels(), staged]
+    while_latched = rows_while_latched(subject)
+    return [*before_stop, STOP_NOW, 0.02, *while_latched, commit(2, "WRONG_STATE"), 0.1]
 
 
 @driving("protocol.md#states")
@@ -198,7 +181,7 @@ def stop_ramps(subject: Subject) -> RequestRows:
     slowest_stop = send("Stop", ramp=0xFFFF)
     disarm = send("Disarm", ramp=subject.ramp)
     slowest_disarm = send("Disarm", ramp=0xFFFF)
-    too_slow_stop = send("Stop", ramp=min(2 * subject.can["ramp_max"], 0xFFFF))
+    too_slow_stop = send("Stop", ramp=min(2 * subject.ramp_max, 0xFFFF))
     while_disarmed = _rows_while_disarmed(subject, 0xFFFF)
     return [
         (playing, send("Set", **part), stop),
@@ -216,16 +199,14 @@ def silence_never_later(subject: Subject) -> RequestRows:
     Compare the time left of the running fade with the new ramp, and keep the fade that ends first.
     """
     subject.require_ramp()
-    slow_stop = send("Stop", ramp=min(400, subject.can["ramp_max"]))
+    slow_stop = send("Stop", ramp=min(400, subject.ramp_max))
     quick_stop = send("Stop", ramp=50)
     playing = subject.all_channels()
-    return [
-        (playing, slow_stop, quick_stop),
-        (playing, quick_stop, slow_stop),
-        (subject.layer_0(), layer(0, ramp=50), slow_stop),
-        # The remaining time of a fade counts, not its duration.
-        (playing, send("Stop", ramp=300), 0.2, send("Stop", ramp=150)),
-    ]
+    courses: list[Row] = [(playing, slow_stop, quick_stop), (playing, quick_stop, slow_stop)]
+    courses.append((subject.layer_0(), layer(0, ramp=50), slow_stop))
+    # The remaining time of a fade counts, not its duration.
+    courses.append((playing, send("Stop", ramp=300), 0.2, send("Stop", ramp=150)))
+    return courses
 
 
 @driving("protocol.md#states")
@@ -236,7 +217,7 @@ def stop_ends_all(subject: Subject) -> RequestRows:
     """
     subject.require_ramp()
     stop = send("Stop", ramp=10)
-    return [(*rows, stop) for rows in subject.transitions(subject.can["ramp_max"])]
+    return [(*rows, stop) for rows in subject.transitions(subject.ramp_max)]
 
 
 @driving("protocol.md#states")
@@ -248,19 +229,11 @@ def stops_are_numbered(subject: Subject) -> RequestRows:
     clear.
     """
     latch = token_after(token_after(token_after(subject.latch)))
-    other_latches = (latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100
-    return [
-        STOP_NOW,
-        STOP_NOW,
-        STOP_NOW,
-        *(send("Clear", latch=number, code="WRONG_LATCH") for number in other_latches),
-        subject.clear,
-        subject.clear,
-        subject.arm,
-        subject.clear,
-        subject.layer_0(),
-        subject.clear,
-    ]
+    rows: list[Row] = [STOP_NOW, STOP_NOW, STOP_NOW]
+    for other_latch in ((latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100):
+        rows.append(send("Clear", latch=other_latch, code="WRONG_LATCH"))
+    rows += [subject.clear, subject.clear, subject.arm, subject.clear]
+    return [*rows, subject.layer_0(), subject.clear]
 
 
 @driving("protocol.md#states")
@@ -298,17 +271,10 @@ def silence(subject: Subject) -> RequestRows:
         layer(1, subject.tone(0, 0.4, frequency=subject.second_frequency)),
         layer(2, subject.tone(second_channel, 0.1)),
     )
-    first_part, *_, last_part = subject.parts(subject.layer_0(), token=4, now=0, count=3)
-    return [
-        subject.arm,
-        playing,
-        stage(subject.layer_0()),
-        send("Silence", ramp=subject.ramp),
-        subject.follow,
-        send("Commit", token=2, code="BAD_TOKEN"),
-        subject.layer_0(),
-        send("Set", **first_part),
-        SILENCE_NOW,
-        send("Set", **last_part),
-        send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
-    ]
+    content = subject.layer_0()
+    first_part, *_, last_part = subject.parts(content, token=4, now=0, count=3)
+    rows: list[Row] = [subject.arm, playing, stage(content)]
+    rows += [send("Silence", ramp=subject.ramp), subject.follow, commit(2, "BAD_TOKEN")]
+    rows += [content, send("Set", **first_part), SILENCE_NOW, send("Set", **last_part)]
+    rows.append(send("Silence", ramp=subject.ramp_max + 1, code="BAD_VALUE"))
+    return rows

@@ -118,7 +118,7 @@ class VoicePlan:
         self._jump = subject.envelope(0.0001)  # onset to the level
         self._pause = 0.004 + self._jump.step / 10_000  # s; until a tone is at its level
         self._quiet = (1 - sum(_SHARES)) / (self.count + 2)  # share of the other voices
-        ramp_max = subject.can["ramp_max"]
+        ramp_max = subject.ramp_max
         duration = self._sets() * (subject.exchange_time + self._pause)
         self._lead = subject.lead(_MOMENTS, ramp_max / 1000 - duration)
         duration += _MOMENTS * self._lead

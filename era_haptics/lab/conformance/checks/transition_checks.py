@@ -19,7 +19,7 @@ def ramps(subject: Subject) -> RequestRows:
     Use (1 - cos(pi s)) / 2 between the amplitude found and the new one, over the ramp of the layer.
     """
     playing = subject.all_channels()
-    ramp_max = subject.can["ramp_max"]
+    ramp_max = subject.ramp_max
     during_ramp = partial(subject.follow, 0.4 * ramp_max / 1000)
     courses: list[Row] = []
     for ramp in {subject.ramp, 20}:
@@ -43,7 +43,7 @@ def cross_fades(subject: Subject) -> RequestRows:
     other_loud = layer(0, subject.tone(frequency=subject.second_frequency), ramp=ramp)
     other_half = layer(0, subject.tone(0, 0.5, frequency=subject.second_frequency), ramp=ramp)
     opposite = layer(0, subject.tone(0, 0.5, 180.0), ramp=ramp)
-    slow_silence = layer(0, ramp=min(3 * ramp, subject.can["ramp_max"]))
+    slow_silence = layer(0, ramp=min(3 * ramp, subject.ramp_max))
     return [
         (half, other_loud),
         (half, opposite),
@@ -157,7 +157,7 @@ def endings_amid(subject: Subject) -> RequestRows:
     timed = replace(to_zero_ending, valid_for=round(1000 * during_onset))
     with_ending = subject.layer_0(subject.tone(ending=ending))
     continued = subject.layer_0(subject.tone(keep=True), ramp=subject.ramp + 75)
-    slow_silence = send("Silence", ramp=min(500, subject.can["ramp_max"]))
+    slow_silence = send("Silence", ramp=min(500, subject.ramp_max))
     return [
         (to_zero_ending, during_onset, layer(0)),
         (to_zero_ending, _end(onset, knots), layer(0)),

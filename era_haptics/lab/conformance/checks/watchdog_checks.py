@@ -15,6 +15,7 @@ from era_haptics.lab.conformance.request_rows import (
     STOP_NOW,
     RequestRows,
     Row,
+    commit,
     layer,
     play_now,
     send,
@@ -90,7 +91,7 @@ async def trips_amid_fades(subject: Subject) -> None:
     longer, also of released voices.
     """
     time = subject.shortest_watchdog
-    ramp = min(3 * time, subject.can["ramp_max"])
+    ramp = min(3 * time, subject.ramp_max)
     for sets in subject.transitions(ramp):
         await subject.in_time(partial(_trip, subject, time / 1000, *sets))
 
@@ -118,8 +119,8 @@ def what_feeds(subject: Subject) -> RequestRows:
         subject.ping,
         subject.layer_0(),
         stage(subject.layer_0(level=0.5)),
-        send("Commit", token=2),
-        send("Commit", token=2),
+        commit(2),
+        commit(2),
         stage(subject.layer_0(), token=2),
         send("Set", **first_part),
         send("Set", **last_part),  # another part is missing
@@ -151,7 +152,7 @@ async def what_does_not_feed(subject: Subject) -> None:
     ]:
         await subject.unfed()
         await subject.run([row])
-    incomplete = send("Commit", token=7, code="INCOMPLETE")
+    incomplete = commit(7, "INCOMPLETE")
     await subject.run([send("Set", **first_part), 0.02, incomplete])
     part_rows = [send("Set", **part) for part in set_parts]
     staged_again = part_rows[0]  # which is dropped
@@ -187,14 +188,14 @@ def _rejected_sets(subject: Subject) -> list[Row]:
 def _rejected_requests(subject: Subject) -> list[Row]:
     """Return requests other than sets that are rejected."""
     return [
-        send("Commit", token=20_000, code="BAD_TOKEN"),
+        commit(20_000, "BAD_TOKEN"),
         send("Commit", token=1, session=77, code="WRONG_SESSION"),
         send("Silence", ramp=0, session=77, code="WRONG_SESSION"),
         send("Arm", watchdog=500, session=77, code="WRONG_SESSION"),
         send("Ping", raw=(1, 0, 0), code="BAD_LENGTH"),
         send("GetAchieved", raw=[16], code="BAD_VALUE"),
         partial(subject.client.exchange, 63, ()),
-        send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
+        send("Silence", ramp=subject.ramp_max + 1, code="BAD_VALUE"),
         send("Arm", watchdog=subject.can["watchdog_max"] + 1, code="BAD_VALUE"),
     ]
 

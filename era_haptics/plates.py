@@ -54,7 +54,7 @@ class SolvedPlate:
     """A rig's plate on its ERAs, solved once at first use, up to the rig's highest frequency.
 
     seed: of a plate, ERAs, channels and fingers drawn at random from the rig's tolerances and
-    solved on another mesh, as in `era table verify`; None for the nominal rig.
+    solved on another mesh, like `era table verify`; None for the nominal rig.
 
     Example:
         >>> plate = era.SolvedPlate(rig)
@@ -82,7 +82,7 @@ class SolvedPlate:
     def modes(self) -> SupportedModes:
         """Natural frequencies (n,) [Hz], damping ratios (n,), and mode shapes at any point (`at`).
 
-        The modes extend to the highest frequency of the rig's limits, as in `era plate modes`.
+        The modes extend to the highest frequency of the rig's limits, like `era plate modes`.
         Raises InputError for a plate without supports.
         """
         rig = self._real
@@ -104,7 +104,7 @@ class SolvedPlate:
         - frequencies (f,) [Hz]: default: the frequencies of a table.
         - fingers: fingers that rest on the plate, as positions [m] or as `Finger`s with their
           loads.
-        - seed: for a plate drawn at random, as in `SolvedPlate(rig, seed=seed)`.
+        - seed: for a plate drawn at random, like `SolvedPlate(rig, seed=seed)`.
 
         Returns complex peak amplitudes h (f, ERAs, p), with ERAs in the order of `rig.eras`:
         weights w (1 = full stroke) give a(t) = Im[h w exp(i omega t)], which without fingers is the
@@ -282,7 +282,7 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
 
 
 def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
-    """Draw all layers of an answer over the plate, each in its color, gray where they mix.
+    """Draw all layers of an answer over the plate, each in its color; mixtures are gray.
 
     Each finger has its frequency, verdict, promised level and contrast next to it. Each layer is
     also drawn alone. Same picture as `era demo`. Raises InputError for an answer without layers.

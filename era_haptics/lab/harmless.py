@@ -1,7 +1,7 @@
 """Reduce users' files and records to harmless values of known keys, so that they can be shared.
 
 Of a configuration these are numbers, quantities, choices, and public words (materials, effects,
-elements, URL schemes), as declared by its schema. User-defined names become `name-1`, `name-2` ...,
+elements, URL schemes) that its schema declares. User-defined names become `name-1`, `name-2` ...,
 the same in all files of a report. Everything else is hidden: free text, file names, host names, and
 every unknown key with its value.
 
@@ -335,7 +335,7 @@ def harmless_records(text: str, names: Names) -> str:
 
 
 def harmless_json(text: str, names: Names) -> str:
-    """Return the harmless part of one JSON value that this program wrote."""
+    """Return the harmless part of a JSON value that this program wrote."""
     return json.dumps(_recorded(json.loads(text), names), indent=2)
 
 

@@ -48,7 +48,7 @@ class CollectedFile:
 
 @dataclass(frozen=True)
 class ReportContents:
-    """Contents of a report: files by name, and what is missing, described without user data."""
+    """Contents of a report: files by name, and missing files, described without user data."""
 
     files: Mapping[str, CollectedFile]
     missing: list[str]

@@ -200,7 +200,7 @@ def _closest(
 def _at_worst_of_pairs(
     group: Sequence[_TouchedRegion], worst_in_pairs: Mapping[str, Mapping[str, Point]]
 ) -> list[_TouchedRegion]:
-    """Return a group at the worst positions of its pairs; at the center if no pair was answered."""
+    """Return a group at the worst positions of its pairs; at the center if none has a result."""
     names = {touched.name for touched in group}
     at_worst = []
     for touched in group:

@@ -15,7 +15,7 @@ _WIDTH = 91  # characters of a line of a remedy
 class Result(StrEnum):
     """Result of a check.
 
-    skipped: the protocol allows the amplifier to lack what is checked, or there is no verdict.
+    skipped: the check needs an optional feature that the amplifier lacks, or there is no verdict.
     not_run: an earlier failure prevents the check.
     """
 

@@ -1,8 +1,8 @@
 """Conversion of this machine's times to times of an amplifier's own clock.
 
-A reading that shows u seconds was taken between s and r, so the amplifier's clock is ahead of this
-machine's by u - r to u - s. The intersection of these intervals over all readings is short, however
-late this machine was.
+A reading that shows u seconds was taken between s and r, so the amplifier's clock leads this
+machine's clock by u - r to u - s. The intersection of these intervals over all readings is short,
+however late this machine was.
 """
 
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, QUANTITIES, SPAN, ahead
@@ -36,7 +36,7 @@ class Dating:
             self._clock = (self._clock + steps * HIGH_STEPS) % SPAN
 
     def expect_steady(self, violation: type[ContractViolation] = ContractViolation) -> None:
-        """Raise ContractViolation (or a class of it) if readings contradict each other."""
+        """Raise ContractViolation (or a subclass) if readings contradict each other."""
         if self.error > 0:
             quantity = "contradiction between readings of its clock"
             raise violation(quantity, expected="0 ms", actual=f"{1e3 * self.error:.3g} ms")

@@ -1,4 +1,4 @@
-"""Client of one amplifier for checks: one message at a time, no retries, no recovery.
+"""Client of a single amplifier for checks: one message at a time, no retries, no recovery.
 
 There is one subclass per kind of wire, which builds and parses frames. Messages that no request was
 waiting for are kept for the checks.
@@ -27,7 +27,7 @@ _DELIVERY_TIMEOUT = 1.5  # s, in addition, for a reply delayed by the machine or
 GATEWAY_TIMEOUT = 1.5
 """Time [s] within which a gateway reports that a unit does not reply."""
 QUIET_TIME = 0.02
-"""Time [s], in addition to that of an exchange, within which a reply arrives."""
+"""Time [s] within which a reply arrives, in addition to the time of an exchange."""
 _MAX_BYTES = 300  # that are kept for a report
 _BATCH = 16  # addresses that are queried together
 _PAUSE = 0.002  # s; between frames
@@ -75,8 +75,8 @@ class JudgeClient(ABC):
     - reply_words: longest reply to each message by message number, if known.
     - quiet: time within which a reply arrives [s]. timeout: how long a reply is awaited [s].
     - wire_time: time on the wire for a request and a reply, from their word counts [s]. transit:
-      that of the longest reply. pace: fraction of wire_time that the line really takes, at most (a
-      terminal has no bit times).
+      wire time of the longest reply. pace: upper bound of the fraction of wire_time that the line
+      really takes (a terminal has no bit times).
     - loss: why the line was lost. last_bytes: received since the last request.
     - neighbours: other addresses that reply. free_address: the highest address without a reply.
       Both are set by `look_around`.
@@ -157,7 +157,7 @@ class JudgeClient(ABC):
 
     @abstractmethod
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
-        """Yield damaged frames, each with a description, which must have no effect and no reply."""
+        """Yield damaged frames with descriptions; they must have no effect and no reply."""
 
     # Requests and replies
 
@@ -203,7 +203,7 @@ class JudgeClient(ABC):
     async def send(self, data: bytes, *earlier: bytes, count: int = 0) -> list[HeardMessage]:
         """Send frames (data last); return the messages received until a reply must have arrived.
 
-        count: number of replies that must arrive, for which the wait is longer.
+        count: number of replies to wait for, beyond the usual time.
         """
         self.inbox.clear()
         self.last_bytes = b""
@@ -275,7 +275,7 @@ class JudgeClient(ABC):
         raise NoReply(request, f"no reply within {self.timeout:g} s{remark}")
 
     def remark(self) -> str:
-        """Describe what is wrong with bytes received instead of a reply, if known."""
+        """Describe the error in bytes received instead of a reply, if known."""
         return ""
 
     # Other amplifiers on the line

@@ -45,7 +45,7 @@ _DRIVING_OBSTACLES: dict[type[CheckOutcome], str] = {
 
 
 class CheckAttempt(NamedTuple):
-    """Outcome of one attempt at a check, and why no further check can run, or ""."""
+    """Outcome of an attempt at a check, and why no further check can run, or ""."""
 
     outcome: CheckOutcome
     obstacle: str

@@ -1,4 +1,4 @@
-"""Checks of one amplifier as the items of a pytest session.
+"""Checks of an amplifier as items of a pytest session.
 
 pytest selects the checks, runs them and writes the JUnit report. Configuration files, environment
 variables and plug-ins that are installed on the computer do not change the session.
@@ -97,13 +97,13 @@ class CheckSession:
         self._drive_permission = may_drive
         self._on_result = on_result
         self._driving_checks = 0  # number of selected checks that drive the channels
-        self._end: BaseException | None = None  # what ended the session early
+        self._end: BaseException | None = None  # the error that ended the session early
 
     def run(self, *, keyword: str = "", junit_xml: Path | None = None) -> None:
         """Run the checks whose names match pytest's expression `keyword`.
 
         junit_xml: file for pytest's JUnit report. Raises CommandError if no check matches, and
-        whatever ended the session early.
+        the error that ended the session early.
         """
         options = [*_OPTIONS, "-k", keyword]
         if junit_xml is not None:
@@ -118,7 +118,7 @@ class CheckSession:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection(self, session: pytest.Session) -> bool:
-        """Collect the checks, and select those that match."""
+        """Collect the checks, and select the matching ones."""
         items: list[CheckItem] = []
         for number, check in self._checks:
             item = CheckItem.from_parent(
@@ -167,7 +167,7 @@ class CheckSession:
         return self._drive_permission(self._driving_checks)
 
     def pytest_keyboard_interrupt(self, excinfo: pytest.ExceptionInfo[BaseException]) -> None:
-        """Keep what ended the session early: an interruption, or the error of an item."""
+        """Keep the error that ended the session early: an interruption, or the error of an item."""
         self._end = excinfo.value.__cause__ or excinfo.value
 
 

@@ -317,8 +317,7 @@ class Subject(Stimuli):
         return "clock" in reply and name != "Mark" and not is_marked
 
     def _dated(self, name: str, values: Values, reply: Values, when: Interval) -> Interval:
-        """Return the interval, on the amplifier's clock, in which a status was true and its request
-        carried out.
+        """Return when a status was true and its request was carried out, on the amplifier's clock.
 
         The clock can be read after the request is carried out, except for GetStatus.
         """
@@ -502,7 +501,7 @@ class Subject(Stimuli):
     async def play_at_moment(self, *layers: LayerSet, lead: float, spacing: float = 0.0) -> None:
         """Play a set from a moment of its clock, `spacing` [s] after the last such moment.
 
-        lead: time by which the Commit precedes its moment [s], if spacing is 0. Raises TooLate if
+        lead: time from the Commit to its moment [s], if spacing is 0. Raises TooLate if
         the Commit can have arrived after its moment.
         """
         await self.send(stage(*layers))

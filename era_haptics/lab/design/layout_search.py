@@ -131,7 +131,7 @@ class LayoutSearch:
         return best
 
     def _best_move(self, layout: ScoredLayout, number: int, step: float) -> ScoredLayout:
-        """Return the best layout after a step [m] of one ERA, or the same if no step gains."""
+        """Return the best layout after moving an ERA by a step [m]; the same if no step gains."""
         places = self.problem.area.moved(layout.positions[number], step)
         trials = _moved_to(layout.positions, number, places)
         best = layout

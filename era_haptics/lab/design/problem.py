@@ -242,8 +242,8 @@ class ContactRule:
     def pooled_sets(self, fingers: int, *, seed: int) -> list[FloatArray]:
         """Draw sets that use only `fingers` finger positions, far apart from each other.
 
-        For quantities computed once per finger. Every finger is the first of one set per number of
-        quiet fingers. Given sets are used unchanged, up to three per finger.
+        For quantities computed once per finger. For every number of quiet fingers, each finger is
+        the first in exactly one set. Given sets are used unchanged, up to three per finger.
         """
         low, high = self.quiet
         if self.given:
@@ -294,7 +294,7 @@ def anywhere(plate: Plate, contents: int = 1) -> ContactRule:
 
 
 def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactRule:
-    """Read a rule from a file with regions (as in a surface layout) or sets; `anywhere` for None.
+    """Read a rule from a file with sets, or regions like a surface layout; `anywhere` for None.
 
     contents: number of simultaneous contents, one finger each. Raises ConfigError for errors in the
     file.
@@ -484,7 +484,7 @@ class DesignProblem:
     def searched_frequencies(self) -> FloatArray:
         """Frequencies of the scores [Hz], a subset of the rig's table frequencies, (f,).
 
-        Their number is proportional to the number of contents, each of which needs separate
+        Their number is proportional to the number of contents, since each content needs separate
         frequencies: for three contents, scores at all 47 frequencies correlate with answers by
         0.83, at 16 by 0.49 (16 layouts of four ERAs).
         """
@@ -514,7 +514,7 @@ class DesignProblem:
     def open_candidates(self, positions: FloatArray) -> IntArray:
         """Return the numbers of candidates far enough from positions (n, 2) [m].
 
-        Raises InputError if there are none.
+        Raises InputError without any.
         """
         gaps = np.linalg.norm(self.candidates[:, None] - positions, axis=-1)
         found = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= self.apart)

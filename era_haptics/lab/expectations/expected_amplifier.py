@@ -72,8 +72,7 @@ def request_text(name: str, values: Values) -> str:
 
 
 class ExpectedAmplifier:
-    """Expected state of an amplifier; state, latch, token and session are None if unknown; times
-    [s].
+    """Expected state of an amplifier; times [s]. Unknown state, latch, token and session: None.
 
     - report: receives violations; always: receives violations that nothing excuses; unclear:
       receives the reason why the state is unknown.

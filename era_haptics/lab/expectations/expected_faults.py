@@ -31,7 +31,7 @@ class ExpectedFaults:
         self._observed.appendleft(_ObservedFault(fault, when))
 
     def correct(self, fault: int, when: Interval) -> None:
-        """Replace the newest fault by the one that the amplifier reports."""
+        """Replace the newest fault by the reported fault."""
         self._observed[0] = _ObservedFault(fault, when)
 
     def check(self, rows: Sequence[Values], when: Interval) -> None:

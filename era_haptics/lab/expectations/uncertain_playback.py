@@ -1,8 +1,8 @@
 """Bounds of an amplifier's outputs after sets whose start is known only as an interval.
 
 A set starts at some time between its commit and the reply, or slightly later. The playback places
-each commit in the middle of its interval. Every transition has a half-width of its start time and a
-radius by which its first amplitude can differ (`Tolerance`). Times [s] refer to any clock.
+each commit in the middle of its interval. Every transition has a `Tolerance`: a half-width of its
+start time, and a radius around its first amplitude. Times [s] refer to any clock.
 """
 
 import math
@@ -262,7 +262,7 @@ class UncertainPlayback:
         """Return the lowest and the highest level of a channel during an interval.
 
         A layer that can end or start in the interval counts from zero to its peak. is_exact: tones
-        of one frequency interfere; otherwise their amplitudes can add up.
+        at the same frequency interfere; otherwise their amplitudes can add up.
         """
         unsure_layers = self.unsure(start, end)
         possible = self._possible_level(channel, start, unsure_layers)

@@ -27,7 +27,7 @@ from model.structure.plate import Plate
 from model.transients.time_response import plate_in_time
 
 MIN_SETTLING = 1.0
-"""Time [s] of a run before what counts, at least: a plate with a usual loss factor has settled."""
+"""Minimum settling time [s] of a run; a plate with a typical loss factor has settled."""
 
 _MAX_SETTLING = 5.0  # s
 _REMAINING = 0.01  # of a free vibration, after settling
@@ -172,7 +172,7 @@ class Desk:
 
     @property
     def looped(self) -> int:
-        """Number of the source that the loop-back brings back, the last one."""
+        """Number of the source that the loop-back returns, the last one."""
         return self.sources.index(self.output)
 
     @property
@@ -216,9 +216,9 @@ class Desk:
 
     @cached_property
     def settling(self) -> float:
-        """Time [s] of a run until free vibrations are at most 1 %, whole periods within 1 to 5 s.
+        """Time [s] until free vibrations have decayed to 1 %, in whole periods from 1 to 5 s.
 
-        By the mode within the rig's limits that decays slowest; those below them hardly move.
+        The slowest mode within the rig's limits decides; modes below the limits hardly move.
         Raises InputError for a plate that is not supported.
         """
         rig = self.rig
@@ -239,7 +239,7 @@ class Desk:
         return min(limits.level, float(np.sqrt(limits.power / len(self.rig.eras))), 1.0)
 
     def check(self, level: float) -> None:
-        """Raise InputError for several amplifiers, and a level beyond the rig's limits."""
+        """Raise InputError for several amplifiers, or a level beyond the rig's limits."""
         if len({self.rig.wiring[era.name].amplifier for era in self.rig.eras}) > 1:
             raise InputError(
                 "all ERAs must be on one sound card, got several amplifiers in the rig"
@@ -251,9 +251,9 @@ class Desk:
             )
 
     def check_times(self, *, seconds: float, slew: float) -> None:
-        """Raise InputError for limits in time that samples from memory would not keep.
+        """Raise InputError for time limits that prerecorded samples would violate.
 
-        seconds: that are played without a pause; slew [1/s]: highest rise of a level.
+        seconds: played without a pause; slew [1/s]: highest rise of a level.
         """
         limits = self.rig.limits
         for key, is_kept, played in (
@@ -268,7 +268,7 @@ class Desk:
                 )
 
     def check_frequencies(self, frequencies: FloatArray, *, what: str) -> None:
-        """Raise InputError for frequencies [Hz] beyond the rig's limits; what: has them."""
+        """Raise InputError for frequencies [Hz] beyond the rig's limits; what: option's name."""
         limits = self.rig.limits
         low, high = limits.frequency_min, limits.frequency_max
         if frequencies.min() < low or frequencies.max() > high:

@@ -77,10 +77,10 @@ def open_desk(
     frequencies: FloatArray | None,
     seed: int,
 ) -> Iterator[tuple[SoundCard, Multisine]]:
-    """An open device for a desk, and the multisine for it.
+    """Open a device for a desk; yield it with its multisine.
 
-    level: None for 0.3, or less where the rig's limits allow less; frequencies (f,) [Hz], None for
-    odd ones within its limits. Raises InputError, LinkError.
+    level: None for 0.3, or less if the rig's limits require it; frequencies (f,) [Hz]: None for odd
+    ones within the limits. Raises InputError, LinkError.
     """
     level = min(_LEVEL, desk.highest) if level is None else level
     desk.check(level)
@@ -99,22 +99,22 @@ def play_run(
     number: int,
     *,
     periods: int,
-    before: ComplexArray | None,
+    first_gain: ComplexArray | None,
     tries: int = TRIES,
 ) -> Run:
-    """Play a run, again where blocks were lost in it or since the first one; keep whole periods.
+    """Play a run and keep whole periods; repeat it if blocks were lost since the first run.
 
-    before (f,): the loop-back's gain in the first run, None in that. Raises InputError, LinkError
-    for inputs that are clipped or silent.
+    first_gain (f,): the loop-back's gain in the first run; None in the first run itself. Raises
+    InputError, LinkError for inputs that are clipped or silent.
     """
 
     def is_whole(recorded: FloatArray) -> bool:
-        """Compare the loop-back: drivers report losses that were none, and miss others."""
+        """Compare the loop-back, since drivers report false losses and miss real ones."""
         check_levels(recorded, desk.named_inputs)
-        if before is not None:  # a block that was lost between two runs changes the delay
+        if first_gain is not None:  # a block that was lost between two runs changes the delay
             gain = loopback_gain(desk, multisine, number, recorded)
-            change = np.abs(gain - before).max()
-            if change > _MAX_CHANGE * np.abs(before).max():
+            change = np.abs(gain - first_gain).max()
+            if change > _MAX_CHANGE * np.abs(first_gain).max():
                 return False
         return has_all_blocks(recorded[:, desk.input - 1], samples=multisine.samples)
 
@@ -174,13 +174,13 @@ def measure(
 def _play_runs(
     desk: Desk, card: SoundCard, multisine: Multisine, *, periods: int, progress: Progress
 ) -> list[Run]:
-    """Play all runs; none is repeated after one that was not whole."""
+    """Play all runs; after an incomplete run, no run is repeated."""
     runs: list[Run] = []
     first_gain: ComplexArray | None = None
     for number in range(multisine.sources):
         tries = TRIES if all(run.is_whole for run in runs) else 1
         run = play_run(
-            desk, card, multisine, number, periods=periods, before=first_gain, tries=tries
+            desk, card, multisine, number, periods=periods, first_gain=first_gain, tries=tries
         )
         runs.append(run)
         if first_gain is None:
@@ -277,7 +277,9 @@ def measure_through(
     repeats = []
     for factor in (0.5, 1.0):
         scaled = replace(multisine, level=factor * multisine.level)
-        run = play_run(desk, card, scaled, _REPEATED_RUN, periods=periods, before=measured.looped)
+        run = play_run(
+            desk, card, scaled, _REPEATED_RUN, periods=periods, first_gain=measured.looped
+        )
         repeats.append(_repeats(desk, measured, scaled, run.whole))
         progress(multisine.sources + len(repeats), total)
     half_level, at_end = repeats

@@ -46,7 +46,7 @@ class PositionsFile:
 
     @property
     def setting(self) -> str:
-        """What must be the same at all places, in words of the file."""
+        """Settings that must be the same at all positions, as text for the file."""
         grams = 1e3 * self.desk.sensors[0].mass
         rig = self.desk.rig.fingerprint[:8]
         return f"level {self.multisine.level:g}, sensor {grams:.6g} g, rig {rig}"
@@ -88,7 +88,7 @@ class PositionsFile:
         raise self._other("places", "one at each line of --sensors", position)
 
     def __str__(self) -> str:
-        """How far it is, in a line."""
+        """Return the progress as a line of text."""
         count, total = len(self.values), len(self.desk.sensors)
         text = f"{count} of {total} places are measured"
         if count:
@@ -113,7 +113,7 @@ def measure_by_moving(
     """Guide a person at a terminal through the positions of a desk.
 
     Return the report, and whether all positions are measured. Raises InputError, LinkError,
-    KeyboardInterrupt, after printing what is saved.
+    KeyboardInterrupt, after printing the progress.
     """
     _check_output(output, is_resumed=is_resumed)
     with Stopwatch() as stopwatch, opened as (card, multisine):

@@ -1,4 +1,4 @@
-"""Multisines, and the responses that follow from runs of one.
+"""Multisines, and responses estimated from runs.
 
 Multisines play on all outputs simultaneously. In run e the phase of source i is rotated by 2 pi e i
 / S, where S is the number of sources and of runs. At every line the S runs are orthogonal (discrete
@@ -22,12 +22,12 @@ PERIOD = 1.0
 _DRAWS = 20  # random phases; the lowest crest factor among them is 3.1 to 3.6
 _RAMP = 0.02  # s
 _STEP = 10  # Hz
-_AROUND = 4  # lines of a period on either side, from which noise is taken
+_AROUND = 4  # lines on either side for the noise estimate
 
 
 @dataclass(frozen=True, eq=False)
 class Multisine:
-    """The signals of so many sources; level: their largest sample; seed: of the phases.
+    """Signals of several sources; level: their largest sample; seed: of the phases.
 
     frequencies (f,) [Hz]: whole multiples of 1 / PERIOD.
     """
@@ -39,7 +39,7 @@ class Multisine:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be played."""
+        """Check that the signals can be played."""
         if self.rate * PERIOD % 1:
             raise InputError(f"sample rate must be a whole number of hertz, got {self.rate:g} Hz")
         lines = self.frequencies * PERIOD
@@ -71,7 +71,7 @@ class Multisine:
 
     @cached_property
     def _amplitudes(self) -> ComplexArray:
-        """Complex amplitudes of cosines of source 0 in run 0, (f,), of the lowest crest drawn."""
+        """Complex amplitudes (f,) of the cosines of source 0 in run 0, with the lowest crest."""
         rng = np.random.default_rng(self.seed)
         sizes = 1 / self.frequencies
         best = sizes + 0j
@@ -96,7 +96,7 @@ class Multisine:
         return self._amplitudes[:, None] * self._phase_factors(run)
 
     def signal(self, run: int, *, periods: float) -> FloatArray:
-        """Samples (n, sources) of so many periods, with ramps at both ends."""
+        """Samples (n, sources) of a number of periods, with ramps at both ends."""
         period = (self._analytic(self._amplitudes)[:, None] * self._phase_factors(run)).real
         samples = np.resize(period, (round(periods * self.samples), self.sources))
         return ramped(samples, round(_RAMP * self.rate))
@@ -120,7 +120,7 @@ def ramped(samples: FloatArray, count: int) -> FloatArray:
 
 
 def multisine_frequencies(low: float, high: float) -> FloatArray:
-    """Odd whole frequencies [Hz] in steps of 10 from above a lowest to below a highest one."""
+    """Return odd whole frequencies [Hz] in steps of 10 between a lowest and a highest one."""
     odd = np.arange(1.0, high + 1e-9, 2)
     odd = odd[odd >= low]
     if not odd.size:
@@ -147,8 +147,8 @@ class ResponseEstimate:
 def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEstimate:
     """Estimate responses from whole periods of each run, (periods x samples, inputs).
 
-    Requires at least two periods: between the lines of one period, the spectrum of several contains
-    only noise. Solves Y = U H^T at each line by least squares, with U the amplitudes played (runs,
+    Requires at least two periods: their spectrum contains only noise between the lines of a single
+    period. Solves Y = U H^T at each line by least squares, with U the amplitudes played (runs,
     sources).
     """
     length = len(recorded[0])

@@ -80,8 +80,8 @@ def tone(
 class OutputFinding:
     """Finding for one output, counted from 1; era: the ERA it drives, None for none.
 
-    polarity (1 or -1) and relative_level (relative to the median and to the model) are None without
-    an accelerometer; verdict: the problem and its remedy.
+    Without an accelerometer, polarity (1 or -1) and relative_level (relative to the median and to
+    the model) are None. verdict: the problem and its remedy.
     """
 
     output: int

@@ -17,7 +17,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 
 SILENT = 1e-5
-"""Of full scale, rms: what an input without a signal stays below."""
+"""RMS of full scale; an input without a signal stays below it."""
 
 CROSSTALK = 0.02
 """Of the loop-back, allowed for other outputs."""
@@ -103,7 +103,7 @@ def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
 def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
     """Raise InputError for clipped inputs, LinkError for silent ones, in one run (n, inputs).
 
-    named: what is connected to each input to be checked, by input number from 1.
+    named: description of each input to be checked, by input number from 1.
     """
     clipped, silent = [], []
     for number, name in named.items():
@@ -128,9 +128,9 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
 
 
 def check_wiring(estimate: ResponseEstimate, desk: Desk) -> None:
-    """Raise InputError unless the loop-back, and no sensor, has its output by a cable.
+    """Raise InputError unless the loop-back, and no sensor, is connected to an output by a cable.
 
-    A cable brings back one output alone. Sensors of a single source do so, too, and may.
+    A cable returns a single output. With a single source, sensors do so too.
     """
     gains = np.median(np.abs(estimate.values), axis=0)  # (inputs, sources)
     cables = _cables(gains, desk)
@@ -146,7 +146,7 @@ def check_wiring(estimate: ResponseEstimate, desk: Desk) -> None:
 
 
 def _cables(gains: FloatArray, desk: Desk) -> NDArray[np.intp]:
-    """Return the source that each input has through a cable, (inputs,), -1 for none.
+    """Return the source connected to each input by a cable, (inputs,), -1 for none.
 
     gains: (inputs, sources).
     """
@@ -184,7 +184,7 @@ def _check_loopback(gains: FloatArray, cables: NDArray[np.intp], desk: Desk) -> 
 
 
 def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
-    """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
+    """Raise InputError for inputs on another clock than the outputs; recorded: runs (n, inputs)."""
     drifts = []
     for number, name in desk.named_inputs.items():
         drift = certain_drift(multisine, [run[:, number - 1] for run in recorded])
@@ -204,7 +204,7 @@ def check_coherence(
     *,
     is_heard: bool = False,
 ) -> None:
-    """Raise LinkError for sensors with other signals, and for ERAs that move no sensor.
+    """Raise LinkError for sensors with foreign signals, and for ERAs that move no sensor.
 
     estimate: from recorded, runs of (n, inputs); is_heard: whether every ERA was detected at
     another position.

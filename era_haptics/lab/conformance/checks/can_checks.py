@@ -54,9 +54,9 @@ _SETTLING = 0.05  # s; after an expected event
 _BOOT_TIME = 0.1  # s; until heartbeats after a reset
 _PING, _SET, _STATUS = (MESSAGES[name].number for name in ("Ping", "Set", "GetStatus"))
 _COMMIT = MESSAGES["Commit"].number
-_NUMBER_LIFE = 0.09  # s; for which a number is kept at least
-_FORGOTTEN = 0.12  # s; after which any number begins
-_FAST = 0.015  # s; exchanges that are quick enough to see for how long a number is kept
+_NUMBER_LIFE = 0.09  # s; a number is kept at least this long
+_FORGOTTEN = 0.12  # s; after this silence any number is accepted
+_FAST = 0.015  # s; exchanges fast enough to observe how long a number is kept
 
 
 @driving("can.md#messages-as-frames", "can")
@@ -111,7 +111,7 @@ async def _follow(
 
 
 async def _expect_any_order(subject: Subject, client: CanClient) -> None:
-    """Require that a set plays whatever the order of its frames."""
+    """Require that a set plays if its frames arrive in any order."""
     for number, order in ((200, -1), (220, 1)):
         part, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
         await asyncio.sleep(_FORGOTTEN)
@@ -247,7 +247,7 @@ async def objects(subject: Subject) -> None:
 def _object_entries(
     subject: Subject, client: CanClient, caps: RequestOutcome, status: RequestOutcome
 ) -> Iterator[ObjectEntry]:
-    """Yield the objects with numbers, those of GetCaps and GetStatus as in their replies."""
+    """Yield the numeric objects; those with capabilities and status must match the replies."""
     serial_number = zlib.crc32(str(subject.identity["serial_number"]).encode())
     yield ObjectEntry(0x1000, 0, 4, 0)
     yield ObjectEntry(0x1001, 0, 1, None if status["fault"] else 0)

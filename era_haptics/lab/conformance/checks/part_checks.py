@@ -24,16 +24,16 @@ from era_haptics.lab.conformance.request_rows import (
 from era_haptics.lab.conformance.subject import Subject
 
 _SHAPED = COMMAND.words + 2 * ENVELOPE.words  # of a command with two empty envelopes
-_MAX_TRIED = 2000  # words of a set: more take a slow wire longer than a set lives
+_MAX_TRIED = 2000  # words of a set; on a slow wire, a longer set expires in transit
 _LONG, _SHORT = 600, 60  # words of a set of several parts
-_SLOW = 0.03  # s; of a line, for an exchange of the longest messages
+_SLOW = 0.03  # s; exchange of the longest messages on a slow line
 _MANY = 127  # parts
-_MANY_ON_MODBUS = 9  # parts; each has a response, and all of them must arrive before they expire
+_MANY_ON_MODBUS = 9  # parts; each has a response, and all must arrive before the set expires
 
 
 def long_set(subject: Subject) -> list[LayerSet]:
-    """Make a set of several parts, a short one on a slow line, so that it does not expire on its
-    way."""
+    """Make a set of several parts; a short set on a slow line, so that it does not expire in
+    transit."""
     is_quick = max(subject.client.transit, subject.exchange_time) < _SLOW
     max_words = _LONG if is_quick else _SHORT
     return _set_of(subject, min(subject.can["set_words"], max_words))
@@ -268,7 +268,7 @@ def max_set(subject: Subject) -> RequestRows:
 
 
 class ExpiringSet:
-    """A set that is sent in parts, and outlives its time; began: by this machine [s]."""
+    """A set that is sent in parts and expires."""
 
     def __init__(self, subject: Subject) -> None:
         self._subject = subject

@@ -36,14 +36,14 @@ from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expectations.tolerances import CLOCK_DRIFT
 from registry import threads
 
-_AROUND = 0.015  # s; from a moment, in which statuses are dense
-_NEAR = 0.0003  # s; by which levels can be older than their clock
-_RISE = 5  # ms; of a set that starts at a moment
+_AROUND = 0.015  # s; statuses are dense this close to a moment
+_NEAR = 0.0003  # s; levels can be this much older than their clock
+_RISE = 5  # ms; ramp of a set that starts at a moment
 _ROUNDING = 0.0015  # of full level
 _SAMPLE = 0.00007  # s, at 16 kHz
 _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-_LONG = 0.2  # s; until a clock rate becomes visible
-_SETTLING = 0.02  # s; until a dropped set becomes visible
+_LONG = 0.2  # s; after this time a clock rate becomes visible
+_SETTLING = 0.02  # s; after this time a dropped set becomes visible
 
 
 @driving("protocol.md#start-of-a-set")

@@ -17,14 +17,14 @@ from era_haptics.lab.conformance.request_rows import (
 )
 from era_haptics.lab.conformance.subject import Subject
 
-_SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
-_LONG = 1.0  # s; in which errors of a phase add up
-_MAX_VOICES = 24  # that are tried
+_SLOW = 400  # steps of frequency: 20 Hz, whose period is long compared with an exchange
+_LONG = 1.0  # s; phase errors accumulate over this time
+_MAX_VOICES = 24  # tried at most
 _MOMENTS = 6  # sets during the first fade that start at a moment
 _OTHER_SETS = 8  # sets during the first fade, in addition to fades and moments
-_SHARES = 0.41, 0.1, 0.06  # of the test level, of the voices that are cut
-_REMAINING = 0.0035, 0.0008  # s; of a fade that counts, and of one that does not
-_PEAK_TIME = 0.15  # s; in which a sum comes to its peak
+_SHARES = 0.41, 0.1, 0.06  # test-level fractions of the voices that are cut short
+_REMAINING = 0.0035, 0.0008  # s; remaining time of a fade that counts, and too short to count
+_PEAK_TIME = 0.15  # s; a sum reaches its peak within this time
 
 
 @driving("protocol.md#the-clock")
@@ -104,8 +104,8 @@ def voices(subject: Subject) -> RequestRows:
 class VoicePlan:
     """Tones and fades that use all voices of two channels.
 
-    count: number of voices to use. fades: number of these that fade in layer 0 and the layers
-    between. ramp: of fades [ms]. lasting: set with a lasting tone in every layer but layer 0.
+    count: number of voices to use. fades: number of fading voices, in all layers but the last.
+    ramp: of fades [ms]. lasting: set with a lasting tone in every layer but layer 0.
     """
 
     def __init__(self, subject: Subject) -> None:
@@ -136,7 +136,7 @@ class VoicePlan:
         return len(_SHARES) + bulk_sets + _OTHER_SETS
 
     def _slow_ending(self) -> Envelope | None:
-        """Return an ending that lasts longer than the ramp; None if there is none."""
+        """Return an ending that lasts longer than the ramp; None with too few knots."""
         ending = self._subject.envelope(0.1, *[_SHARES[1]] * 8)
         duration = ending.step * (len(ending.knots) + 1)
         return ending if duration >= 10 * self.ramp / 3 else None

@@ -24,7 +24,7 @@ from era_haptics.lab.conformance.request_rows import (
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
-_READINGS = {"mark": "Mark", "electrical": "GetMeasured"}  # by their features
+_READINGS = {"mark": "Mark", "electrical": "GetMeasured"}  # read requests of optional features
 _WATCHDOG = QUANTITIES["watchdog"]
 _DROPPED = ({"session": 77}, {"token": 1}, {"token": 0x8001})
 """Values for which a part is dropped."""

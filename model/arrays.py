@@ -22,18 +22,18 @@ Point: TypeAlias = tuple[float, float]
 
 
 def lattice(x: FloatArray, y: FloatArray) -> FloatArray:
-    """All points of a lattice, (len(x) * len(y), 2): row after row, x running first."""
+    """Return all points of a lattice, (len(x) * len(y), 2), row by row, x running first."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def least_gap(places: FloatArray) -> float:
-    """Least distance of any two of some places (n, 2), infinite for fewer than two."""
+    """Return the smallest distance between positions (n, 2), infinite for fewer than two."""
     gaps = np.linalg.norm(places[:, None] - places, axis=-1)
     return float(gaps[np.triu_indices(len(places), 1)].min(initial=np.inf))
 
 
 def rms(values: ArrayLike) -> float:
-    """Root mean square, 0 of nothing."""
+    """Return the root mean square, 0 for an empty array."""
     squares = np.square(values)
     return float(np.sqrt(np.mean(squares))) if np.size(squares) else 0.0
 
@@ -41,8 +41,8 @@ def rms(values: ArrayLike) -> float:
 def nullable(values: ArrayLike | None) -> Any:
     """Convert to JSON numbers, an array to lists; None for missing values and values that are not
     finite."""
-    found = np.asarray(values, dtype=float)
-    return np.where(np.isfinite(found), found, np.array(None)).tolist()
+    numbers = np.asarray(values, dtype=float)
+    return np.where(np.isfinite(numbers), numbers, np.array(None)).tolist()
 
 
 _Item = TypeVar("_Item")
@@ -52,12 +52,12 @@ NEARLY = 1e-5
 
 
 def best_of(scores: ArrayLike) -> int:
-    """Index of the first of the highest scores (n,)."""
+    """Return the index of the first of the highest scores (n,)."""
     return int(best_along(scores, axis=0))
 
 
 def best_along(scores: ArrayLike, axis: int) -> IntArray:
-    """Index of the first of the highest scores along an axis."""
+    """Return the index of the first of the highest scores along an axis."""
     values = np.asarray(scores)
     return np.asarray(_are_near(values, values.max(axis=axis, keepdims=True)).argmax(axis=axis))
 
@@ -76,37 +76,39 @@ def best_first(scores: ArrayLike) -> IntArray:
 
 
 def _are_near(values: NDArray[Any], better: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether values are nearly as high as better ones; infinite ones are equal to themselves."""
+    """Return whether values are nearly as high as better values; infinite values equal
+    themselves."""
     with np.errstate(invalid="ignore"):
         return np.asarray((values == better) | (values >= better - NEARLY * np.abs(better)))
 
 
 def best_few(scores: ArrayLike, count: int) -> IntArray:
-    """The first of `best_first`, up to count, without an order of the rest."""
+    """Return the first indices of `best_first`, up to a count, without sorting all scores."""
     values = np.asarray(scores)
     if len(values) <= count:
         return best_first(values)
-    least = np.partition(values, -count)[-count]
-    among = np.flatnonzero(values >= least - 2 * NEARLY * np.abs(least))
+    threshold = np.partition(values, -count)[-count]
+    among = np.flatnonzero(values >= threshold - 2 * NEARLY * np.abs(threshold))
     return np.asarray(among[best_first(values[among])[:count]])
 
 
 def best_rows(scores: ArrayLike, count: int) -> IntArray:
-    """Indices (count, ...) along the first axis of the highest scores, the highest first."""
-    left = np.array(scores)
-    found = []
+    """Return indices (count, ...) of the highest scores along the first axis, highest first."""
+    remaining = np.array(scores)
+    rows = []
     for _ in range(count):
-        best = best_along(left, axis=0)[None]
-        np.put_along_axis(left, best, -np.inf, axis=0)
-        found.append(best)
-    return np.concatenate(found)
+        best = best_along(remaining, axis=0)[None]
+        np.put_along_axis(remaining, best, -np.inf, axis=0)
+        rows.append(best)
+    return np.concatenate(rows)
 
 
 def best_by(items: Sequence[_Item], score: Callable[[_Item], float]) -> _Item:
-    """The first of the items with the highest scores."""
-    return items[best_of([score(each) for each in items])]
+    """Return the first of the items with the highest scores."""
+    return items[best_of([score(item) for item in items])]
 
 
 def ranked_by(items: Sequence[_Item], score: Callable[[_Item], float]) -> list[_Item]:
-    """Items in the order of `best_first`."""
-    return [items[each] for each in best_first([score(each) for each in items])]
+    """Return items in the order of `best_first`."""
+    order = best_first([score(item) for item in items])
+    return [items[number] for number in order]

@@ -29,11 +29,11 @@ def expect_instance(value: object, cls: type, *, what: str, made_by: str) -> Non
 
 
 MAX_VALUE = 1e18
-"""Of a physical quantity in SI units: a million times diamond's modulus of elasticity."""
+"""Largest physical quantity in SI units: a million times diamond's modulus of elasticity."""
 
 
 def expect_number(value: object, *, what: str, unit: str) -> None:
-    """Raise InputError for anything but a real number that a float holds."""
+    """Raise InputError for a value that is not a real number, or too large for a float."""
     if (isinstance(value, int) and abs(value) > MAX_VALUE) or not isinstance(value, Real):
         raise InputError(f"{what} must be a number of {unit}, got {shown(value)}")
 
@@ -45,27 +45,28 @@ def expect_between(value: float, low: float, high: float = MAX_VALUE, *, what: s
 
 
 def expect_values(
-    of: object, what: str, *, above: str = "", at_least: str = "", finite: str = ""
+    record: object, what: str, *, above: str = "", at_least: str = "", finite: str = ""
 ) -> None:
-    """Raise InputError for attributes beyond MAX_VALUE, negative ones, or 0 where above it.
+    """Raise InputError for attributes of a record that are out of bounds.
 
-    above, at_least, finite: names of attributes with spaces between.
+    Names of attributes, separated by spaces. above: must be above 0; at_least: must be 0 or more;
+    finite: can be negative. All have at most the magnitude MAX_VALUE.
     """
     for name in f"{above} {at_least} {finite}".split():
-        value, is_above = getattr(of, name), name in above.split()
-        least = -MAX_VALUE if name in finite.split() else 0.0
-        expect_between(value, least, what=f"{what}: {name}")
-        if is_above and value < 1 / MAX_VALUE:
+        value = getattr(record, name)
+        low = -MAX_VALUE if name in finite.split() else 0.0
+        expect_between(value, low, what=f"{what}: {name}")
+        if name in above.split() and value < 1 / MAX_VALUE:
             raise InputError(f"{what}: {name} must be above zero, got {value}")
 
 
 def is_whole(value: object) -> bool:
-    """Whether it is a whole number, Python's or numpy's."""
+    """Return whether a value is a whole number, of Python or numpy."""
     return isinstance(value, Integral)
 
 
 def expect_path(value: object, *, what: str) -> Path:
-    """A path from text or a path; raises InputError for anything else."""
+    """Return a path from text or a path; raises InputError for other values."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{what} must be text or a Path, got {shown(value)}")
     return Path(value)

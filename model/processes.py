@@ -80,11 +80,11 @@ def _interrupts_blocked() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    former_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, former_mask)
 
 
 def _start_worker(solve: Callable[[Any, Any], Any], shared: Any, stop: Connection) -> None:
@@ -104,7 +104,7 @@ def _end_on(stop: Connection) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has; a pool's worker waits for tasks for ever else."""
+    """End this process when its parent ends; otherwise a pool's worker waits for tasks forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -121,13 +121,13 @@ Progress: TypeAlias = Callable[[int, int], None]
 
 
 def unseen(done: int, total: int) -> None:
-    """Progress that is not shown."""
+    """Ignore progress."""
 
 
-def check_progress(given: object) -> None:
-    """Raise InputError for what cannot be called."""
-    if not callable(given):
-        raise InputError(f"progress must be a function of done and total, got {shown(given)}")
+def check_progress(progress: object) -> None:
+    """Raise InputError for a value that is not callable."""
+    if not callable(progress):
+        raise InputError(f"progress must be a function of done and total, got {shown(progress)}")
 
 
 SCHEDULER_TIMEOUT = 10.0  # s
@@ -145,8 +145,8 @@ def on_cluster(
     """Yield numbers of tasks with their results in the order in which they are done.
 
     address: of a scheduler, for example tcp://192.168.1.5:8786; solve: a function of a module;
-    shared: its first argument. A task whose worker is lost is solved again. Raises InputError where
-    no scheduler answers, it has no workers, or one runs other code.
+    shared: its first argument. A task whose worker is lost is solved again. Raises InputError if
+    no scheduler replies, it has no workers, or a worker runs other code.
     """
     if not _ADDRESS.fullmatch(str(address)):
         raise InputError(

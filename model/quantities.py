@@ -10,10 +10,10 @@ _ROUNDING = 1e-9  # of a percentage: 100 * 0.29 is 28.999999999999996
 def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
     """Format a value of an SI unit, or of none, in the unit usual for plates: `17 kN/m`."""
     factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
-    shown = f"{value * factor:.{digits}g}"
-    if "e+" in shown:  # a plate of a meter is 1000 mm
-        shown = f"{value * factor:.0f}"
-    return f"{shown} {shown_unit}".strip()
+    text = f"{value * factor:.{digits}g}"
+    if "e+" in text:  # a plate of a meter is 1000 mm
+        text = f"{value * factor:.0f}"
+    return f"{text} {shown_unit}".strip()
 
 
 def with_error(value: float, error: float, unit: str = "", *, sign: str = "") -> str:
@@ -22,24 +22,29 @@ def with_error(value: float, error: float, unit: str = "", *, sign: str = "") ->
     Units: see `in_display_unit`; sign: "+" also shows the sign of values above zero.
     """
     factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
-    value, error = value * factor, error * factor
+    value *= factor
+    error *= factor
     if not (math.isfinite(error) and error > 0):
         return f"{value:{sign}.5g} ± {error:.2g} {shown_unit}".strip()
-    exponent = int(f"{error:.1e}".partition("e")[2])
-    decimals = max(0, 1 - exponent)
+    _, _, exponent = f"{error:.1e}".partition("e")
+    decimals = max(0, 1 - int(exponent))
     return f"{value:{sign}.{decimals}f} ± {error:.{decimals}f} {shown_unit}".strip()
 
 
 def percent(share: float) -> str:
     """Format a share as `12 %`; below a tenth with two digits, `1.2 %`."""
-    return f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
+    if share > 0.1:
+        return f"{100 * share:.0f} %"
+    return f"{100 * share:.2g} %"
 
 
 def percent_down(share: float) -> str:
-    """Format a share as `79 %`, rounded down: one below a limit never reads as the limit."""
+    """Format a share as `79 %`, rounded down, so that a share below a limit never reads as it."""
     return f"{math.floor(100 * share + _ROUNDING)} %"
 
 
 def counted(number: int, thing: str, *, plural: str | None = None) -> str:
     """Format a number with its noun; plural: if it is not the noun with an s."""
-    return f"{number} {thing if number == 1 else plural or f'{thing}s'}"
+    if number == 1:
+        return f"1 {thing}"
+    return f"{number} {plural or f'{thing}s'}"

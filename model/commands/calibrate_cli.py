@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from model.rig.rig import Rig
 
 NO_FIT = 1
-"""Exit status where a fit does not explain the measurement."""
+"""Exit status if a fit does not explain the measurement."""
 
 _HEADING = re.compile(rb"# .* by `era (calibrate|outputs|rig identify|rig merge)`:\s*$|\Z")
 """First line of a file that a command fitted, or of an empty one."""
@@ -51,15 +51,15 @@ _DEAD = (
 )
 
 
-def check_rig_output(output: Path, *taken: Path) -> None:
+def check_rig_output(output: Path, *inputs: Path) -> None:
     """Raise InputError unless a fitted rig can be written to a path.
 
     A rig that was fitted before is replaced; a file that a person wrote, or that the command
-    reads (`taken`), is not.
+    reads (`inputs`), is not.
     """
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
-    for file in taken:
+    for file in inputs:
         if output.resolve() == file.resolve():
             raise InputError(f"--output must differ from {file}; choose another name")
     if output.is_file():
@@ -160,14 +160,11 @@ def calibrate(
         refusal = _NO_FIT if calibration.held_out else _UNCHECKED.format(least=LEAST_SENSORS + 1)
     elif calibration.dead_eras:
         refusal = _DEAD.format(eras=", ".join(calibration.dead_eras))
-    made = f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"
-    files = (
-        write_fitted_rig(
-            output, (rig, calibration.rig), [made, *rows, *notes], calibration_errors(calibration)
-        )
-        if refusal is None
-        else []
-    )
+    files: list[str] = []
+    if refusal is None:
+        origin = f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"
+        errors = calibration_errors(calibration)
+        files = write_fitted_rig(output, (rig, calibration.rig), [origin, *rows, *notes], errors)
     if picture is not None:
         from model.figures.calibration import calibration_figure
         from model.figures.style import save_figure

@@ -373,21 +373,21 @@ def materials(as_json: JsonOption = False) -> None:
             print(f"era: warning: {problem}", file=sys.stderr)
 
 
-def _material_json(name: str, known: "KnownMaterial") -> dict[str, Any]:
+def _material_json(name: str, entry: "KnownMaterial") -> dict[str, Any]:
     """Return the numbers and sources of a material as a JSON object."""
     return {
         "name": name,
-        "E_pa": known.material.E,
-        "rho_kg_m3": known.material.rho,
-        "nu": known.material.nu,
-        "moduli_pa": known.material.moduli,
-        "by_frequency": [list(row) for row in known.by_frequency],
-        "source": known.source,
-        "variation": known.variation,
-        "loss_factor": known.loss_factor,
-        "by_kelvin": known.by_kelvin,
-        "by_moisture": known.by_moisture,
-        "weather": known.weather,
+        "E_pa": entry.material.E,
+        "rho_kg_m3": entry.material.rho,
+        "nu": entry.material.nu,
+        "moduli_pa": entry.material.moduli,
+        "by_frequency": [list(row) for row in entry.by_frequency],
+        "source": entry.source,
+        "variation": entry.variation,
+        "loss_factor": entry.loss_factor,
+        "by_kelvin": entry.by_kelvin,
+        "by_moisture": entry.by_moisture,
+        "weather": entry.weather,
     }
 
 

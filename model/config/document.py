@@ -38,7 +38,7 @@ KeyPath: TypeAlias = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class ConfigProblem:
-    """One thing wrong in a file: its line (None: the file as a whole), the key, what to do."""
+    """One problem in a file: line (None for the whole file), key, and message with remedy."""
 
     line: int | None
     key: str
@@ -46,7 +46,7 @@ class ConfigProblem:
 
 
 class ConfigError(InputError):
-    """A configuration file that cannot be used, with every problem that was found in it."""
+    """A configuration file that cannot be used, with all of its problems."""
 
     def __init__(self, source: str, problems: Sequence[ConfigProblem]) -> None:
         """Format the problems, one per line: `FILE:LINE: key: problem; remedy`.
@@ -81,7 +81,7 @@ class Document:
 
     @cached_property
     def lines(self) -> Mapping[KeyPath, int]:
-        """What `find_lines` finds."""
+        """Line of every key and list entry by path."""
         return self.find_lines()
 
     @property
@@ -90,7 +90,7 @@ class Document:
         return self.text or data_text(self.data)
 
     def value(self, path: KeyPath) -> Value:
-        """The value at a path of keys; raises KeyError for a missing one."""
+        """Return the value at a path of keys; raises KeyError for a missing key."""
         value: Value = self.data
         for key in path:
             if not (isinstance(value, dict) and isinstance(key, str)):
@@ -99,23 +99,23 @@ class Document:
         return value
 
     def line_of(self, path: KeyPath) -> int | None:
-        """The line of a key or list entry, or of the nearest one above it if it is missing."""
+        """Return the line of a key or list entry; for a missing one, of the nearest parent."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path, 1) if self.lines else None
 
     def beside(self, name: str) -> Path:
-        """The path of a file that this one names, relative to its folder; `~` is the home."""
+        """Return the path of a named file, relative to this document's folder; `~` is the home."""
         # Path.expanduser raises without a home; this leaves the name unchanged.
         return Path(self.source).parent / os.path.expanduser(name)  # noqa: PTH111
 
     def problem(self, path: KeyPath, message: str) -> ConfigProblem:
-        """A problem at a key."""
+        """Return a problem at a key."""
         return ConfigProblem(self.line_of(path), key_name(path), message)
 
 
 MAX_FILE_NAME = 1000
-"""Most characters of the name of a file in a configuration."""
+"""Maximum length of the name of a file in a configuration."""
 
 _MAX_PART = 255  # bytes, on all usual file systems
 
@@ -124,12 +124,12 @@ _NULL_WORDS = frozenset(("none", "None", "NONE", "nil", "Nil", "NIL"))
 
 
 def is_null_word(value: object) -> bool:
-    """Whether a value is a word that other languages have for null, which YAML takes as text."""
+    """Return whether a value is a word for null in another language, which YAML reads as text."""
     return isinstance(value, str) and value in _NULL_WORDS
 
 
 def is_file_name(value: object) -> TypeGuard[str]:
-    """Whether a value can be the name of a file: text that every system takes as one."""
+    """Return whether a value is text that every operating system accepts as the name of a file."""
     if not isinstance(value, str) or not 0 < len(value) <= MAX_FILE_NAME:
         return False
     if "\0" in value or is_null_word(value):
@@ -145,8 +145,8 @@ def key_name(path: KeyPath) -> str:
         if isinstance(part, int):
             name += f"[{part}]"
         else:
-            shown = part if re.fullmatch(r"[\w-]{1,40}", part) else repr(part[:40])
-            name += f".{shown}" if name else shown
+            word = part if re.fullmatch(r"[\w-]{1,40}", part) else repr(part[:40])
+            name += f".{word}" if name else word
     return name
 
 
@@ -205,9 +205,10 @@ def parse_document(
     source: str, text: str, *, if_empty: str = IF_EMPTY, max_values: int = MAX_DOCUMENT_VALUES
 ) -> Document:
     """Read the text of a YAML file that came from a source; raises ConfigError."""
-    if found := _NOT_ALLOWED.search(text):
-        line = text.count("\n", 0, found.start()) + 1
-        message = f"character U+{ord(found[0]):04X} is not allowed in YAML; remove it"
+    forbidden = _NOT_ALLOWED.search(text)
+    if forbidden is not None:
+        line = text.count("\n", 0, forbidden.start()) + 1
+        message = f"character U+{ord(forbidden[0]):04X} is not allowed in YAML; remove it"
         raise ConfigError(source, [ConfigProblem(line, "", message)])
     reader = _PlainReader(source, text, max_values)
     try:
@@ -227,14 +228,14 @@ def _whole(source: str, message: str) -> ConfigError:
 
 
 def _unparsed(source: str, text: str, error: yaml.MarkedYAMLError) -> ConfigError:
-    """The error for text that the parser refuses, with the line and what to do."""
+    """Return the error for text that is not YAML, with the line and a remedy."""
     mark = error.problem_mark or error.context_mark
     line = None if mark is None else mark.line + 1
-    said = " ".join(part for part in (error.context, error.problem) if part)
+    problem = " ".join(part for part in (error.context, error.problem) if part)
     remedy = "" if line is None else _remedy(text, line)
-    if not remedy and "expected ','" in said:
+    if not remedy and "expected ','" in problem:
         line, remedy = _missing_comma(text, mark)
-    return ConfigError(source, [ConfigProblem(line, "", f"is not valid YAML: {said}{remedy}")])
+    return ConfigError(source, [ConfigProblem(line, "", f"is not valid YAML: {problem}{remedy}")])
 
 
 _BLANKS = re.compile(r"(?<!^)\ufeff|[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000]")
@@ -250,14 +251,16 @@ def _remedy(text: str, line: int) -> str:
     if len(lines) == line and lines[-1].startswith("%"):
         return "; remove this line"
     for number in range(len(lines), 0, -1):
-        wrong = lines[number - 1].partition("#")[0]
-        where = "" if number == line else f" of line {number}"
-        if found := _BLANKS.search(wrong):
-            what = "tab" if found[0] == "\t" else f"character U+{ord(found[0]):04X}"
-            return f"; write a space in place of the {what} in column {found.start() + 1}{where}"
-        if found := _NO_KEY.match(wrong):
-            return f"; write a colon and a space in column {found.end()}{where}"
-        if wrong.strip() and number < line:
+        content = lines[number - 1].partition("#")[0]
+        place = "" if number == line else f" of line {number}"
+        blank = _BLANKS.search(content)
+        if blank is not None:
+            name = "tab" if blank[0] == "\t" else f"character U+{ord(blank[0]):04X}"
+            return f"; write a space in place of the {name} in column {blank.start() + 1}{place}"
+        key = _NO_KEY.match(content)
+        if key is not None:
+            return f"; write a colon and a space in column {key.end()}{place}"
+        if content.strip() and number < line:
             break
     return ""
 
@@ -266,19 +269,23 @@ _COMMENT = re.compile(r"(^|\s)#.*")
 
 
 def _missing_comma(text: str, mark: Any) -> tuple[int, str]:
-    """Where a comma lacks in braces or brackets, its line and what to do; mark: of what follows.
+    """Return the line of a missing comma in braces or brackets, and the remedy.
 
-    At a colon that is the key before it, which was read as more of the value.
+    mark: position at which the parser stopped, after the comma. If it stopped at a colon, it read
+    the key before the colon as a part of the value.
     """
     lines = [*text.splitlines()[: mark.line + 1], ""]
-    before, after = lines[mark.line][: mark.column], lines[mark.line][mark.column :]
-    lines[mark.line :] = [re.sub(r"\S+\s*$", "", before) if after.startswith(":") else before]
-    kept = [_COMMENT.sub("", each).rstrip() for each in lines]
-    number = max((n for n, each in enumerate(kept) if each), default=0)
-    words = kept[number].split() or [""]
+    start, rest_of_line = lines[mark.line][: mark.column], lines[mark.line][mark.column :]
+    if rest_of_line.startswith(":"):
+        start = re.sub(r"\S+\s*$", "", start)
+    number, value = 0, ""
+    for line_number, line in enumerate([*lines[: mark.line], start]):
+        content = _COMMENT.sub("", line).rstrip()
+        if content or line_number == 0:
+            number, value = line_number, content
+    words = value.split() or [""]
     return number + 1, (
-        f"; write a comma, or the bracket that closes, after {words[-1]} in column "
-        f"{len(kept[number])}"
+        f"; write a comma, or the bracket that closes, after {words[-1]} in column {len(value)}"
     )
 
 
@@ -314,8 +321,9 @@ class _PlainReader:
             raise self._refused((), event, message + _remedy(self._text, _line(event)))
         data = self._value((), event)
         next(self._events)
-        if isinstance(more := next(self._events), yaml.DocumentStartEvent):
-            raise self._refused((), more, "must be one document, got another; remove it")
+        following = next(self._events)
+        if isinstance(following, yaml.DocumentStartEvent):
+            raise self._refused((), following, "must be one document, got another; remove it")
         return data
 
     def _value(self, path: KeyPath, event: Any) -> Any:
@@ -371,7 +379,7 @@ _WORDS: dict[str, Scalar] = {
 
 
 def plain_value(text: str) -> Scalar:
-    """The value of unquoted text by the core schema of YAML 1.2, decimal numbers alone."""
+    """Return the value of unquoted text in the core schema of YAML 1.2; only decimal numbers."""
     text = text.strip()  # of blanks that are no spaces, too
     if text in _WORDS:
         return _WORDS[text]
@@ -393,7 +401,7 @@ def _line(at: Any) -> int:
 
 
 class _PlainDumper(yaml.SafeDumper):
-    """Quotes each text that reading would take for a number or a word."""
+    """Quotes text that would be read as a number, a boolean or null."""
 
     def text(self, value: str) -> yaml.ScalarNode:
         """Make the node of a text."""
@@ -409,7 +417,7 @@ _PlainDumper.add_representer(str, _PlainDumper.text)
 
 
 def data_text(data: Mapping[str, Value]) -> str:
-    """The text of a new file with this data, in its order; inner lists and mappings on one line."""
+    """Return the text of a new file with this data; inner lists and mappings are on one line."""
     return str(
         yaml.dump(
             {**data},

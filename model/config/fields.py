@@ -8,7 +8,7 @@ plate.
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from types import UnionType
@@ -86,16 +86,16 @@ class Quantity:
         result = quantity(value, self.dimension)
         if self.above < result < self.below and self.at_least <= result <= self.at_most:
             return result
-        limits = [
-            f"{words} {limit:g} {self.dimension.unit}".strip()
-            for words, limit in (
-                ("above", self.above),
-                ("at least", self.at_least),
-                ("at most", self.at_most),
-                ("below", self.below),
-            )
-            if abs(limit) != float("inf")
-        ]
+        bounds = {
+            "above": self.above,
+            "at least": self.at_least,
+            "at most": self.at_most,
+            "below": self.below,
+        }
+        limits = []
+        for words, bound in bounds.items():
+            if math.isfinite(bound):
+                limits.append(f"{words} {bound:g} {self.dimension.unit}".strip())
         bare = f"; a bare number is in {self.dimension.unit}" if self.dimension.unit else ""
         raise ValueError(f"must be {' and '.join(limits)}, got {value}{bare}")
 
@@ -137,15 +137,17 @@ FileName = Annotated[str, AfterValidator(_file_name)]
 
 
 def quantities(field: FieldInfo) -> list[Quantity]:
-    """Every Quantity that a field's type carries, however deep."""
+    """Return every Quantity in the type of a field, at any depth."""
+    direct = [part for part in field.metadata if isinstance(part, Quantity)]
+    return [*direct, *_nested_quantities(field.annotation)]
 
-    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
-        found = [part for part in metadata if isinstance(part, Quantity)]
-        for part in get_args(annotation):
-            found += [part] if isinstance(part, Quantity) else within(part)
-        return found
 
-    return within(field.annotation, field.metadata)
+def _nested_quantities(annotation: Any) -> Iterator[Quantity]:
+    for part in get_args(annotation):
+        if isinstance(part, Quantity):
+            yield part
+        else:
+            yield from _nested_quantities(part)
 
 
 class ByKind:
@@ -163,16 +165,16 @@ class ByKind:
         self, schema: Any, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         sections = schema["metadata"]["sections"]
-        return {"anyOf": [handler(each.__pydantic_core_schema__) for each in sections]}
+        return {"anyOf": [handler(section.__pydantic_core_schema__) for section in sections]}
 
 
 def _validated_by_kind(sections: Sequence[type[Section]], value: Any) -> Section:
-    kinds = [kind for each in sections for kind in _kinds(each)]
-    given = value.get("kind", kinds[0]) if isinstance(value, dict) else kinds[0]
-    if given not in kinds:
+    kinds = [kind for section in sections for kind in _kinds(section)]
+    kind_name = value.get("kind", kinds[0]) if isinstance(value, dict) else kinds[0]
+    if kind_name not in kinds:
         expected = " or ".join(repr(kind) for kind in kinds)
         error = InitErrorDetails(
-            type="literal_error", loc=("kind",), input=given, ctx={"expected": expected}
+            type="literal_error", loc=("kind",), input=kind_name, ctx={"expected": expected}
         )
         raise ValidationError.from_exception_data("kind", [error])
     return section_by_kind(sections, value).model_validate(value)
@@ -185,15 +187,15 @@ def _kinds(section: type[Section]) -> tuple[str, ...]:
 def section_by_kind(sections: Sequence[type[PartT]], value: object) -> type[PartT]:
     """Return the section for the `kind` of a mapping; the first one for an unknown or missing
     kind."""
-    given = value.get("kind") if isinstance(value, dict) else None
-    return next((each for each in sections if given in _kinds(each)), sections[0])
+    kind = value.get("kind") if isinstance(value, dict) else None
+    return next((section for section in sections if kind in _kinds(section)), sections[0])
 
 
 class Validation(Generic[SectionT]):
     """Checks a document against its sections, and collects all problems."""
 
     def __init__(self, document: Document, root: type[SectionT]) -> None:
-        """Find every key that is unknown, missing, or has a value that its section refuses."""
+        """Find every unknown key, missing key and invalid value."""
         self._section: SectionT | None = None
         self.document = document
         self._problems: list[ConfigProblem] = []
@@ -203,7 +205,7 @@ class Validation(Generic[SectionT]):
             self._add_errors(error, root)
 
     def part(self, path: KeyPath, section: type[PartT]) -> PartT | None:
-        """A section if it is valid on its own, for checks across sections; else None."""
+        """Return a section if it is valid on its own, for checks across sections; else None."""
         try:
             return section.model_validate(self.document.value(path))
         except (KeyError, ValidationError):
@@ -221,14 +223,14 @@ class Validation(Generic[SectionT]):
             return None
 
     def field(self, path: KeyPath, section: type[Section]) -> Any:
-        """One field of a section if it is valid on its own; else None."""
+        """Return one field of a section if it is valid on its own; else None."""
         try:
             return _field_reader(section, str(path[-1])).validate_python(self.document.value(path))
         except (KeyError, ValidationError):
             return None
 
     def mapping(self, path: KeyPath) -> Mapping[str, Value]:
-        """A mapping of the file, unchecked; empty if missing."""
+        """Return a mapping of the file, unchecked; empty if missing."""
         try:
             value = self.document.value(path)
         except KeyError:
@@ -242,7 +244,7 @@ class Validation(Generic[SectionT]):
     def _add_errors(
         self, error: ValidationError, section: type[Section], *, below: KeyPath = ()
     ) -> None:
-        """Add the errors of a section below a path, as many as are reported and one more."""
+        """Add the errors of a section below a path, up to one more than are reported."""
         for details in error.errors(include_url=False)[: MAX_PROBLEMS + 1]:
             self._problems.append(_problem(self.document, section, details, below=below))
 
@@ -266,12 +268,12 @@ def _problem(
     """Convert a pydantic error of a section below a path."""
     # pydantic marks an error in the key of a mapping by a last entry "[key]".
     path = tuple(part for part in details["loc"] if part != "[key]")
-    given, context = details["input"], details.get("ctx", {})
+    value, context = details["input"], details.get("ctx", {})
     bound = context.get("min_length", context.get("max_length", 0))
     match details["type"]:
         case "extra_forbidden":
-            known = [*_section_at(root, path[:-1], document).model_fields]
-            message = f"unknown key; {did_you_mean(str(path[-1]), known)}known: {', '.join(known)}"
+            keys = [*_section_at(root, path[:-1], document).model_fields]
+            message = f"unknown key; {did_you_mean(str(path[-1]), keys)}known: {', '.join(keys)}"
         case "literal_error" | "enum":
             message = _no_choice(details, context["expected"])
         case kind if kind in _MESSAGES:
@@ -282,11 +284,11 @@ def _problem(
                 entries=counted(bound, "entry", plural="entries"),
                 characters=counted(bound, "character"),
                 # too many entries are not counted
-                count=len(given) if isinstance(given, list | dict) else 0,
+                count=len(value) if isinstance(value, list | dict) else 0,
             )
         case _:
             message = f"{reworded(details['msg'])}, got {_shown(details)}"
-    if is_null_word(given) and _WRITE_NULL not in message:
+    if is_null_word(value) and _WRITE_NULL not in message:
         message += _without_value(root, path, document)
     return document.problem((*below, *path), message)
 
@@ -321,13 +323,13 @@ _MESSAGES = {
 
 
 def _in_quotes(details: ErrorDetails) -> str:
-    """Remedy for text that YAML takes for a number or a boolean."""
-    given = details["input"]
-    return "" if given is None or isinstance(given, dict | list) else "; write it in quotes"
+    """Return the remedy for text that YAML reads as a number or a boolean."""
+    value = details["input"]
+    return "" if value is None or isinstance(value, dict | list) else "; write it in quotes"
 
 
 def _no_choice(details: ErrorDetails, expected: str) -> str:
-    """Message for a value that is not among the choices, `'x', 'y' or 'z'` of pydantic."""
+    """Return the message for a value that is not one of the choices, `'x', 'y' or 'z'`."""
     choices = expected.replace("'", "")
     meant = did_you_mean(str(details["input"])[:_MAX_NAME], re.findall(r"'([^']+)'", expected))
     return f"must be {choices}, got {_shown(details)}" + (f"; {meant.strip()}" if meant else "")
@@ -349,7 +351,7 @@ def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[
         while get_origin(kind) in (Annotated, Union, UnionType):
             annotations = getattr(kind, "__metadata__", ())
             kind = get_args(kind)[0]  # of a field that may be left out
-            if any(isinstance(each, ByKind) for each in annotations):
+            if any(isinstance(annotation, ByKind) for annotation in annotations):
                 kind = section_by_kind(get_args(kind), document.value(path[:number]))
     section: type[Section] = kind
     return section
@@ -371,7 +373,7 @@ class Rectangle:
     height: float
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a point is within."""
+        """Return whether a point is within the rectangle."""
         return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
 
     @property
@@ -404,7 +406,7 @@ class Circle:
     radius: float
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a point is within."""
+        """Return whether a point is within the circle."""
         return math.dist((x, y), (self.x, self.y)) <= self.radius
 
     @property
@@ -456,7 +458,7 @@ class Polygon:
 
     @property
     def centre(self) -> _Point:
-        """The center of area, or the mean of the corners where sides cross out the area."""
+        """Centroid, or the mean of the corners if crossing sides leave no area."""
         following = (*self.points[1:], self.points[0])
         cross = [
             x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(self.points, following, strict=True)
@@ -465,11 +467,11 @@ class Polygon:
         if abs(area) < _TOLERANCE:
             xs, ys = zip(*self.points, strict=True)
             return (sum(xs) / len(xs), sum(ys) / len(ys))
-        pairs = list(zip(self.points, following, cross, strict=True))
-        return (
-            sum((one[0] + other[0]) * each for one, other, each in pairs) / (6 * area),
-            sum((one[1] + other[1]) * each for one, other, each in pairs) / (6 * area),
-        )
+        x = y = 0.0
+        for (x0, y0), (x1, y1), product in zip(self.points, following, cross, strict=True):
+            x += (x0 + x1) * product
+            y += (y0 + y1) * product
+        return (x / (6 * area), y / (6 * area))
 
     def corners(self) -> Sequence[_Point]:
         """Return all corners."""
@@ -531,21 +533,21 @@ class ShapedSection(Section):
         return Polygon(tuple(self.polygon or ()))
 
     def shape_problem(self, sides: _Point | None) -> tuple[tuple[str, ...], str] | None:
-        """Return where and why the section lacks a single shape on a plate of these sides [m], else
+        """Return the key and the problem of a section without a single shape on the plate, else
         None.
 
-        sides: None for any plate.
+        sides [m]: length and width of the plate, None for any plate.
         """
-        given = [name for name in ShapedSection.model_fields if getattr(self, name) is not None]
-        if len(given) != 1:
-            known, found = ", ".join(ShapedSection.model_fields), " and ".join(given) or "none"
-            return (), f"must have one of {known}, got {found}"
+        keys = [name for name in ShapedSection.model_fields if getattr(self, name) is not None]
+        if len(keys) != 1:
+            known_keys = ", ".join(ShapedSection.model_fields)
+            return (), f"must have one of {known_keys}, got {' and '.join(keys) or 'none'}"
         (x0, y0), (x1, y1) = box_of(self.shape)
         length, width = sides or (x1, y1)
         d = _TOLERANCE
         if sides is None or (min(x0, y0) >= -d and x1 <= length + d and y1 <= width + d):
             return None
-        return (given[0],), (
+        return (keys[0],), (
             f"must lie on the plate of {length:g} m by {width:g} m, got ({x0:g}, {y0:g}) to "
             f"({x1:g}, {y1:g}) m; coordinates start at its south-west corner"
         )

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache
-from typing import (
-    TYPE_CHECKING,
-)
+from typing import TYPE_CHECKING, Any
 
 from model.errors import InputError
 
@@ -22,26 +20,23 @@ if TYPE_CHECKING:
 class Dimension:
     """A kind of value, such as a length.
 
-    Units with a zero of their own, such as degC, are refused unless its SI unit has one, too.
+    Units with their own zero, such as degC, are rejected unless the SI unit has one, too.
     """
 
     name: str
-    """Its name with article."""
+    """Name with article."""
 
     unit: str
-    """Its SI unit; a bare number of degC counts from 0 degC."""
+    """SI unit; a bare number in degC counts from 0 degC."""
 
     example: str
-    """An example to write."""
+    """Example for messages."""
 
     factors: Mapping[str, str] = field(default_factory=dict, compare=False)
-    """Factors of common units, as pint has them: loading pint doubles a command's start.
-
-    Any other unit of the dimension is found by pint.
-    """
+    """Factors of common units. Loading pint, which knows all units, doubles a command's start."""
 
     def key(self, name: str) -> str:
-        """The name of such a value with its unit, as in JSON: `stiffness_n_m`."""
+        """Return the JSON key of a value, with its unit: `stiffness_n_m`."""
         unit = self.unit.lower().replace(" ", "").replace("/", "_").replace("^", "")
         return f"{name}_{unit}".removesuffix("_")
 
@@ -111,10 +106,10 @@ _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", re.ASCII)
 
 
 def quantity(value: object, dimension: Dimension) -> float:
-    """The value in the dimension's SI unit; a bare number is one already.
+    """Return a value in the SI unit of its dimension; a bare number is in this unit.
 
-    `12 in` is exactly 0.3048. Raises InputError for another dimension, an unknown unit, anything
-    but a number, and NaN or infinity.
+    `12 in` is exactly 0.3048. Raises InputError for another dimension, an unknown unit, a value
+    that is not a number, and NaN or infinity.
     """
     if isinstance(value, str):
         # Word processors write other blanks, and a minus sign of their own.
@@ -129,47 +124,49 @@ def quantity(value: object, dimension: Dimension) -> float:
 
 
 def _parse(text: str, dimension: Dimension) -> float:
-    """The value of a text `NUMBER [UNIT]`."""
+    """Return the value of a text `NUMBER [UNIT]`."""
     match = _QUANTITY.fullmatch(text) if len(text) <= _MAX_LENGTH else None
     if match is None:
         raise _refusal(text, dimension, "is not a number with a unit")
     number, unit = match.groups()
     if unit is None:
         return _to_float(number, dimension)
-    known = dimension.factors.get(unit)
-    factor, zero = (Decimal(known), 0) if known else unit_scale(text, unit, dimension)
+    common = dimension.factors.get(unit)
+    factor, zero = (Decimal(common), 0) if common else unit_scale(text, unit, dimension)
     return _to_float(Decimal(number) * factor + zero, dimension)
 
 
 def unit_scale(text: str, unit: str, dimension: Dimension) -> tuple[Decimal, Decimal]:
-    """The factor from a unit to the SI unit of a dimension, and what its 0 is there, by pint.
+    """Return the factor from a unit to the SI unit of a dimension, and its zero in the SI unit.
 
     The base units must be the same, not just the dimension: revolutions per minute and rad/s have
-    the dimension of Hz. A unit whose 0 is not 0 of the SI unit, as of degC and K, is refused where
-    that has no zero of its own, and a logarithmic one, which has no factor, everywhere.
+    the dimension of Hz. A unit with another zero than the SI unit, such as degC and K, is rejected
+    unless the SI unit has its own zero. A logarithmic unit, which has no factor, is always
+    rejected.
     """
     import pint
 
     registry = _registry()
     try:
-        given, own = (
-            registry.parse_units(each.replace("·", "*")) for each in (unit, dimension.unit)
-        )
-        factor, base = registry.get_base_units(given)
-        _, expected = registry.get_base_units(own)
-        zero, start = (
-            Decimal(str(registry.Quantity(Decimal(0), each).to_base_units().magnitude))
-            for each in (given, own)
-        )
+        parsed_unit = registry.parse_units(unit.replace("·", "*"))
+        si_unit = registry.parse_units(dimension.unit.replace("·", "*"))
+        factor, base = registry.get_base_units(parsed_unit)
+        _, expected = registry.get_base_units(si_unit)
+        zero, si_zero = _zero_of(registry, parsed_unit), _zero_of(registry, si_unit)
     except pint.UndefinedUnitError as error:
         raise _refusal(text, dimension, f"has an unknown unit, {unit}") from error
     except TypeError as error:  # of Decimal, for a logarithm
         raise _refusal(text, dimension, f"is not {dimension.name}") from error
     except (pint.PintError, ArithmeticError, AttributeError, ValueError) as error:
         raise _refusal(text, dimension, f"has an invalid unit, {unit}") from error
-    if base != expected or (zero and not start):
+    if base != expected or (zero and not si_zero):
         raise _refusal(text, dimension, f"is not {dimension.name}")
-    return Decimal(str(factor)), zero - start
+    return Decimal(str(factor)), zero - si_zero
+
+
+def _zero_of(registry: "pint.UnitRegistry[Decimal]", unit: Any) -> Decimal:
+    """Return the zero of a unit in base units."""
+    return Decimal(str(registry.Quantity(Decimal(0), unit).to_base_units().magnitude))
 
 
 @cache
@@ -184,7 +181,7 @@ def _registry() -> "pint.UnitRegistry[Decimal]":
 
 
 def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
-    """The nearest double; raises InputError for an integer that is too large."""
+    """Return the nearest double; raises InputError for an integer that is too large."""
     try:
         return float(value)
     except OverflowError as error:
@@ -192,7 +189,7 @@ def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
 
 
 def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
-    """The error for a value, with what to write instead."""
+    """Return the error for a value, with a remedy."""
     text = as_written(value)
     text = text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
     bare = f"a bare number in {dimension.unit}" if dimension.unit else "a bare number"
@@ -200,7 +197,7 @@ def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
 
 
 def as_written(value: object) -> str:
-    """A value as it is written in a file."""
+    """Return a value as text in a file."""
     if value is None:
         return "nothing"
     return str(value).lower() if isinstance(value, bool) else repr(value)
@@ -211,7 +208,7 @@ MAX_FREQUENCIES = 2000
 
 
 def parse_point(text: str, *, what: str) -> tuple[float, float]:
-    """Position [m] from `X,Y`; what: the option, for the error."""
+    """Parse `X,Y` to a position [m]; what: the option, for the error."""
     parts = text.split(",")
     try:
         x, y = (float(part) for part in parts)
@@ -225,7 +222,7 @@ def parse_point(text: str, *, what: str) -> tuple[float, float]:
 
 
 def in_metres(x: float, y: float, *, length: float, width: float) -> str:
-    """Remedy for a place off the plate that would be on it in cm or mm, else "".
+    """Return the remedy for a position that would be on the plate in cm or mm, else "".
 
     length, width [m]: of the plate. Coordinates below 1 are not taken for another unit.
     """
@@ -240,7 +237,7 @@ def in_metres(x: float, y: float, *, length: float, width: float) -> str:
 
 
 def parse_pair(text: str, *, what: str) -> tuple[int, int]:
-    """Two counts from `12x9`."""
+    """Parse `12x9` to two counts."""
     match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)
     if match is None:
         raise InputError(f"{what} must be two numbers such as 12x9, got {text!r}")
@@ -248,9 +245,9 @@ def parse_pair(text: str, *, what: str) -> tuple[int, int]:
 
 
 def parse_frequencies(text: str) -> "FloatArray":
-    """Frequencies (f,) [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
+    """Parse `LO:HI:STEP`, both ends included, or a list `60,110,250`, to frequencies (f,) [Hz].
 
-    Raises InputError for anything else, and for a frequency given twice.
+    Raises InputError for other text, and for a repeated frequency.
     """
     import numpy as np  # which other commands do without
 

@@ -25,7 +25,7 @@ from registry.files import open_regular
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 Types: TypeAlias = Mapping[str, str | Collection[str]]
-"""By the name of an array its type (`dtype.str`), or the types that it may have."""
+"""Accepted type (`dtype.str`), or types, of each array by name."""
 
 WHOLE_NUMBERS = frozenset(np.dtype(order + code).str for order in "<>" for code in "bBhHiIqQ")
 """Types of whole numbers of any size."""
@@ -100,8 +100,8 @@ def arrays_in(
         if is_missing or members.keys() - types.keys() or len(members) < len(entries):
             required = ", ".join(sorted(types.keys() - set(optional)))
             further = f", optionally {', '.join(sorted(optional))}" if optional else ""
-            given = shown(", ".join(sorted(members)))
-            raise ValueError(f"members must be {required}{further}, got {given}")
+            names = shown(", ".join(sorted(members)))
+            raise ValueError(f"members must be {required}{further}, got {names}")
         for name, entry in members.items():
             if entry.compress_type != zipfile.ZIP_STORED:
                 raise ValueError(f"{name}: must not be compressed; write it with numpy.savez")
@@ -122,13 +122,13 @@ def arrays_in(
 def _check_end(file: BinaryIO, file_bytes: int) -> None:
     """Raise an error of UNREADABLE for a directory too large to read, or without an end."""
     file.seek(max(0, file_bytes - _END.size - _END_64_SIZE))
-    before, end = file.read(_END_64_SIZE), file.read()
+    locator, end = file.read(_END_64_SIZE), file.read()
     if len(end) != _END.size:
         raise zipfile.BadZipFile("the file is too short")
     mark, _, directory_bytes, remark_bytes = _END.unpack(end)
     if mark != _END_MARK or remark_bytes:
         raise zipfile.BadZipFile("the file must end with the directory of an archive")
-    if before.startswith(_END_64) or directory_bytes > _MAX_DIRECTORY:
+    if locator.startswith(_END_64) or directory_bytes > _MAX_DIRECTORY:
         raise ValueError(f"the directory must be of up to {_MAX_DIRECTORY >> 10} KiB")
 
 

@@ -57,7 +57,7 @@ def write_rows(path: Path, rows: Iterable[Iterable[object]], *, line_end: str = 
 
 
 def as_frame(columns: Columns) -> Any:
-    """A pandas DataFrame of columns; raises InputError where pandas is not installed."""
+    """Return a pandas DataFrame of columns; raises InputError if pandas is not installed."""
     try:
         pandas = import_module("pandas")
     except ModuleNotFoundError as error:
@@ -201,7 +201,7 @@ def _has_points(path: Path, skipped: int) -> bool:
 
 
 def _rows_from(path: Path, skipped: int) -> Iterator[str]:
-    """All rows of a file; the skipped ones are empty, so that lines keep their numbers."""
+    """Yield all rows of a file; skipped rows are empty, so that lines keep their numbers."""
     for number, row in enumerate(_text_rows(path)):
         yield "" if number < skipped else row
 
@@ -230,8 +230,8 @@ def _check_header(
     absent = [name for name in (*columns, *optional) if name not in header]
     missing = [name for name in columns if name not in header]
     unknown = [name for name in header if name not in (*columns, *optional)]
-    more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
-    named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED]) + more
+    further = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
+    named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED]) + further
     is_misspelt = any(did_you_mean(name, absent) for name in unknown)
     if missing or is_misspelt or len(set(header)) < len(header):
         problems = [f"{', '.join(missing)} missing"] if missing else []

@@ -1,11 +1,11 @@
 """Modes of a surface from another program: universal files (UFF), NumPy files (.npz) and CSV.
 
-Of a universal file nodes (datasets 15 and 2411), shell elements (2412), modes (55 and 2414) and
-units (164) are read by position, as the definitions of the format state them (Structural Dynamics
-Research Laboratory, University of Cincinnati); other datasets are passed over. Values may be in any
+In a universal file, nodes (datasets 15 and 2411), shell elements (2412), modes (55 and 2414) and
+units (164) are read by position, according to the definitions of the format (Structural Dynamics
+Research Laboratory, University of Cincinnati); other datasets are ignored. Values can be in any
 spelling of Fortran. A .npz has the arrays nodes (n, 3) [m], frequencies (r,) [Hz] and shapes
-(r, n, 3), or (r, n) along the normal, [1/sqrt(kg)]; further damping_ratios (r,), places (n, 2) [m]
-of the nodes in coordinates of touches, and faces (k, 3 or more), rows of node numbers from 0. A
+(r, n, 3), or (r, n) along the normal, [1/sqrt(kg)], and optionally damping_ratios (r,), places
+(n, 2) [m], the nodes in touch coordinates, and faces (k, 3 or more), rows of node numbers from 0. A
 .csv has a line for each node of each mode, with the columns of `_COLUMNS` and damping_ratio.
 """
 
@@ -50,7 +50,7 @@ _BINARY_ZIP = b"PK\x03\x04"
 
 @dataclass(frozen=True, eq=False)
 class ModeShapes:
-    """Modes as a file has them, in SI and of unit modal mass."""
+    """Modes of a file, in SI units and with unit modal mass."""
 
     nodes: FloatArray
     """Positions (n, 3) [m]."""
@@ -200,13 +200,14 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
                 f"got {len(mode.nodes)} nodes, {len(set(mode.nodes) & set(numbers))} of them in "
                 "common; export one component"
             )
-    missing = [each for each in numbers if each not in nodes]
+    missing = [number for number in numbers if number not in nodes]
     if missing:
         raise InputError(
             f"{modes[0].place}: node {missing[0]} of the modes must have coordinates (dataset 15 "
             f"or 2411), got none of {len(missing)} nodes; export all nodes"
         )
-    if local := turned & set(numbers):
+    local = turned & set(numbers)
+    if local:
         raise InputError(
             f"{path}: displacements must be in the global system, got a local one of node "
             f"{min(local)}; export shapes in global coordinates"
@@ -214,11 +215,11 @@ def _from_universal(path: Path, content: bytes) -> ModeShapes:
     rows = {number: row for row, number in enumerate(numbers)}
     # Modal masses are in the file's unit of mass, force s² / length.
     return ModeShapes(
-        np.array([nodes[each] for each in numbers]) / length,
+        np.array([nodes[number] for number in numbers]) / length,
         np.array([mode.frequency for mode in modes]),
         np.array([mode.shape for mode in modes]) * math.sqrt(force / length),
         np.array([mode.damping_ratio for mode in modes]),
-        [[rows[each] for each in face] for face in faces if rows.keys() >= set(face)],
+        [[rows[number] for number in face] for face in faces if rows.keys() >= set(face)],
     )
 
 
@@ -236,7 +237,7 @@ class _Mode:
 
 
 def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
-    """Yield the nodes of each shell element in turn."""
+    """Yield the nodes of each shell element."""
     lines = enumerate(block.rows[1:], start=block.line + 2)
     rows, at = [numbers_in(row, f"{path}:{line}") for line, row in lines], 0
     while at < len(rows):
@@ -247,12 +248,12 @@ def _read_faces(path: Path, block: DatasetBlock) -> Iterator[list[int]]:
             )
         kind, count = int(rows[at][1]), int(rows[at][5])
         at += 1 + (kind in _BEAMS)
-        found: list[float] = []
-        while at < len(rows) and len(found) < count:
-            found += rows[at]
+        numbers: list[float] = []
+        while at < len(rows) and len(numbers) < count:
+            numbers += rows[at]
             at += 1
         if kind in _SHELLS:
-            yield [int(each) for each in found]
+            yield [int(number) for number in numbers]
 
 
 def _read_mode(path: Path, block: DatasetBlock) -> _Mode | None:
@@ -368,18 +369,18 @@ def _complex_mode(place: str, kind: int, analysis: int, reals: Sequence[float]) 
 
 
 def _values(path: Path, block: DatasetBlock, head: int, count: int) -> tuple[list[int], FloatArray]:
-    """Numbers of the nodes (n,), and so many values at each (n, count)."""
+    """Return the numbers of the nodes (n,), and the values at each node (n, count)."""
     size = 1 + math.ceil(count / _VALUES_A_ROW)
     numbers, values = [], []
     for entry, (number, *rows) in enumerate(rows_of(path, block, size, head)):
-        own = [each for row in rows for each in row]
-        if len(number) != 1 or len(own) != count:
+        node_values = [value for row in rows for value in row]
+        if len(number) != 1 or len(node_values) != count:
             raise InputError(
                 f"{path}:{block.line + 1 + head + size * entry}: a node must have its number and "
-                f"then {count} values, got {len(own)}; the file is damaged, export it again"
+                f"then {count} values, got {len(node_values)}; the file is damaged, export it again"
             )
         numbers.append(int(number[0]))
-        values.append(own)
+        values.append(node_values)
     return numbers, np.array(values)
 
 

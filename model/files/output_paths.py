@@ -35,7 +35,7 @@ def check_place(path: Path, *, example: str) -> None:
 
 
 def begins_with(path: Path, start: bytes) -> bool:
-    """Whether a file exists that is empty or begins with these bytes."""
+    """Return whether a file exists that is empty or begins with these bytes."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -45,7 +45,7 @@ def begins_with(path: Path, start: bytes) -> bool:
 def check_picture_name(path: Path, *, instead: str = "") -> None:
     """Raise InputError for an ending that is not in PICTURE_ENDINGS.
 
-    instead: what other ending the caller takes, in words.
+    instead: other endings that the caller accepts, in words.
     """
     if path.suffix.lower() not in PICTURE_ENDINGS:
         raise InputError(

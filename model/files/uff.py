@@ -1,7 +1,7 @@
 """Universal files (UFF): functions at nodes (dataset 58), nodes (15, 2411) and units (164).
 
-The format of modal analysis since the 1970s, ASCII or binary, with fields named as in pyuff, which
-writes files. It skips over damage and knows one spelling of numbers, so files are read here.
+The format of modal analysis since the 1970s, ASCII or binary. Fields have the names of pyuff, which
+writes files. It ignores damage and reads one spelling of numbers only, so files are read here.
 """
 
 import math
@@ -158,7 +158,7 @@ def read_universal(path: Path) -> Universal:
 
 
 def text_of(path: Path, content: bytes) -> str:
-    """The text of a measured file in UTF-8, or UTF-16 with a mark; raises InputError."""
+    """Return the text of a measured file in UTF-8, or UTF-16 with a mark; raises InputError."""
     try:
         text = content.decode(_encoding(content))
     except UnicodeDecodeError as error:
@@ -169,7 +169,7 @@ def text_of(path: Path, content: bytes) -> str:
 
 
 def text_stream(file: BinaryIO) -> TextIOWrapper:
-    """The text of an open file in UTF-8, or UTF-16 with a mark, with any line ends."""
+    """Return the text of an open file in UTF-8, or UTF-16 with a mark, with any line ends."""
     start = file.read(2)
     file.seek(0)
     return TextIOWrapper(file, _encoding(start), newline=None)
@@ -202,7 +202,7 @@ def open_measured(path: Path) -> Iterator[BinaryIO]:
 class DatasetBlock:
     """One dataset: the line of its opening mark, its number, the content between its marks.
 
-    byte_order: of a binary one, as NumPy has it; empty of text.
+    byte_order: of a binary dataset, as in NumPy; empty for text.
     """
 
     line: int
@@ -217,7 +217,7 @@ class DatasetBlock:
 
 
 def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
-    """Datasets of a file, between lines of `    -1` alone."""
+    """Yield the datasets of a file, between lines of `    -1` alone."""
     if content.startswith(BYTE_ORDER_MARKS):  # text, as an editor saved it
         content = text_of(path, content).encode()
     if b"\n" not in content:
@@ -282,8 +282,8 @@ def _as_58(function: Function) -> dict[str, Any]:
 
 
 def _header(place: str, block: DatasetBlock) -> dict[str, Any]:
-    """The fields of a dataset 58 by name; 0 for numbers that are left out."""
-    head, found = b"\n".join(block.rows[:_HEADER_LINES]), dict[str, Any]()
+    """Return the fields of a dataset 58 by name; 0 for missing numbers."""
+    head, fields = b"\n".join(block.rows[:_HEADER_LINES]), dict[str, Any]()
     try:
         lines = head.decode().split("\n")
     except UnicodeDecodeError:
@@ -291,29 +291,30 @@ def _header(place: str, block: DatasetBlock) -> dict[str, Any]:
     try:
         for name, (line, first, last, read) in _FIELDS.items():
             text = lines[line][first:last].strip()
-            found[name] = text if read is str else read(text.upper().replace("D", "E") or "0")
+            fields[name] = text if read is str else read(text.upper().replace("D", "E") or "0")
     except (IndexError, ValueError) as error:
         raise InputError(f"{place}: dataset 58 cannot be read; export it again") from error
     for name in ("abscissa_min", "abscissa_inc"):
-        if not math.isfinite(found[name]):
+        if not math.isfinite(fields[name]):
             raise InputError(
-                f"{place}: {name} must be a finite number, got {found[name]:g}; export it again"
+                f"{place}: {name} must be a finite number, got {fields[name]:g}; export it again"
             )
-    if found["num_pts"] < 1:
+    if fields["num_pts"] < 1:
         raise InputError(
-            f"{place}: number of values must be at least 1, got {found['num_pts']}; export it again"
+            f"{place}: number of values must be at least 1, got {fields['num_pts']}; export it "
+            "again"
         )
-    return found
+    return fields
 
 
 def _function(path: Path, block: DatasetBlock) -> Function:
     place = f"{path}:{block.line}"
-    found = _header(place, block)
-    count = found["num_pts"]
-    is_complex, is_even = found["ord_data_type"] in (5, 6), found["abscissa_spacing"] == 1
+    header = _header(place, block)
+    count = header["num_pts"]
+    is_complex, is_even = header["ord_data_type"] in (5, 6), header["abscissa_spacing"] == 1
     shape = (count, 1 + is_complex + (not is_even))
     read = _bytes_of if block.byte_order else _numbers_of
-    values = read(path, block, found, math.prod(shape))
+    values = read(path, block, header, math.prod(shape))
     if len(values) < math.prod(shape):
         raise InputError(
             f"{place}: record must have {math.prod(shape)} numbers according to its header, got "
@@ -325,34 +326,34 @@ def _function(path: Path, block: DatasetBlock) -> Function:
             f"{place}: values of the record must be finite, up to {MAX_VALUE:g}; measure it again"
         )
     x = (
-        found["abscissa_min"] + np.arange(count) * found["abscissa_inc"]
+        header["abscissa_min"] + np.arange(count) * header["abscissa_inc"]
         if is_even
         else values[:, 0]
     )
     if count == 0 or not ((np.diff(x) > 0).all() and abs(x[-1]) <= MAX_VALUE):
         raise InputError(f"{place}: abscissa of the record must ascend; export it again")
     data = values[:, -2] + 1j * values[:, -1] if is_complex else values[:, -1]
-    names = (_name(found["rsp_ent_name"]), _name(found["ref_ent_name"]))
+    names = (_name(header["rsp_ent_name"]), _name(header["ref_ent_name"]))
     return Function(
         place,
-        found["func_type"],
-        found["rsp_node"],
-        found["ref_node"],
+        header["func_type"],
+        header["rsp_node"],
+        header["ref_node"],
         names,
-        (found["rsp_dir"], found["ref_dir"]),
+        (header["rsp_dir"], header["ref_dir"]),
         x,
         data,
-        tuple(found[f"{axis}_spec_data_type"] for axis in ("abscissa", "ordinate", "orddenom")),
-        (_name(found["ordinate_axis_units_lab"]), _name(found["orddenom_axis_units_lab"])),
-        _name(found["abscissa_axis_units_lab"]),
+        tuple(header[f"{axis}_spec_data_type"] for axis in ("abscissa", "ordinate", "orddenom")),
+        (_name(header["ordinate_axis_units_lab"]), _name(header["orddenom_axis_units_lab"])),
+        _name(header["abscissa_axis_units_lab"]),
         _name(block.rows[_NOTE].decode("utf-8", "replace")),
     )
 
 
-def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: int) -> FloatArray:
+def _bytes_of(path: Path, block: DatasetBlock, header: Mapping[str, Any], count: int) -> FloatArray:
     """Return up to `count` numbers of a binary record."""
     data = block.content.split(b"\n", _HEADER_LINES)[-1]
-    size = 8 if found["ord_data_type"] in (4, 6) else 4
+    size = 8 if header["ord_data_type"] in (4, 6) else 4
     if data[count * size :].strip(b"\0 \t\r\n"):
         raise InputError(
             f"{path}:{block.line}: record must end after {count} numbers according to its header, "
@@ -364,9 +365,9 @@ def _bytes_of(path: Path, block: DatasetBlock, found: Mapping[str, Any], count: 
 
 
 def _numbers_of(
-    path: Path, block: DatasetBlock, found: Mapping[str, Any], count: int
+    path: Path, block: DatasetBlock, header: Mapping[str, Any], count: int
 ) -> FloatArray:
-    """So many numbers of a record in ASCII, or all; what fills their last line is left out."""
+    """Return up to `count` numbers of a record in ASCII, without the filling of the last line."""
     numbers: list[float] = []
     for line, row in enumerate(block.rows[_HEADER_LINES:], start=block.line + 1 + _HEADER_LINES):
         if _NUMBER.sub(b"", row).strip() or (len(numbers) >= count and row.strip()):
@@ -379,10 +380,10 @@ def _numbers_of(
 
 
 def numbers_in(row: bytes, place: str) -> list[float]:
-    """All numbers of a row, in any spelling of Fortran.
+    """Return all numbers of a row, in any spelling of Fortran.
 
-    place: file and line, for the error. Raises InputError for anything else, and for NaN and
-    infinite numbers.
+    place: file and line, for the error. Raises InputError for other text, and for NaN and infinite
+    numbers.
     """
     if _NUMBER.sub(b"", row).strip():
         raise InputError(f"{place}: line must be of numbers, got {_quoted(row)}; export it again")
@@ -399,7 +400,7 @@ def _quoted(row: bytes) -> str:
 
 
 def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
-    """By what lengths and forces of the file are divided to have meters and newtons."""
+    """Return the divisors from lengths and forces of a file to meters and newtons."""
     place = f"{path}:{block.line}"
     rows = block.rows[1:]
     code = numbers_in(rows[0][:10], f"{path}:{block.line + 2}") if rows else []
@@ -423,7 +424,7 @@ def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
 def rows_of(
     path: Path, block: DatasetBlock, size: int, head: int = 1
 ) -> Iterator[list[list[float]]]:
-    """Yield the numbers of records of so many rows each, behind a head."""
+    """Yield the numbers of records, each of `size` rows, after a head."""
     rows = block.rows[head:]
     if len(rows) % size:
         raise InputError(

@@ -1,7 +1,7 @@
 """WAV files of PCM or float.
 
-What writes to a pipe, and what lost power while it recorded, leaves sizes of 0 or of about 2^31 or
-2^32: such samples go on to the end of the file.
+A program that writes to a pipe, or a recorder that lost power, leaves sizes of 0 or of about 2^31
+or 2^32. Such samples extend to the end of the file.
 """
 
 import struct
@@ -56,24 +56,26 @@ def samples_of(content: bytes) -> tuple[int, FloatArray]:
 
 
 def _chunks(content: bytes, order: str) -> tuple[bytes, memoryview]:
-    """The format of a file, at least what all have, and its samples; raises InputError."""
+    """Return the format of a file, 16 bytes or more, and its samples; raises InputError."""
     if content[:4] not in (b"RIFF", b"RIFX", b"RF64") or content[8:12] != b"WAVE":
         raise _refused("it must begin with RIFF and WAVE")
     (stated,) = struct.unpack_from(f"{order}I", content, 4)
-    at, found = 12, dict[bytes, bytes]()
+    at, chunks = 12, dict[bytes, bytes]()
     while at + 8 <= len(content):
         name, size = struct.unpack_from(f"{order}4sI", content, at)
         at += 8
-        if name == b"data" and len(found.get(b"fmt ", b"")) >= 16:
-            left = len(content) - at
-            if len(found.get(_LONG, b"")) >= 16:
-                size = struct.unpack_from("<Q", found[_LONG], 8)[0] or size
+        if name == b"data" and len(chunks.get(b"fmt ", b"")) >= 16:
+            available = len(content) - at
+            if len(chunks.get(_LONG, b"")) >= 16:
+                size = struct.unpack_from("<Q", chunks[_LONG], 8)[0] or size
             if size >= _UNKNOWN_SIZE or (size == 0 and stated + 8 < len(content)):
-                size = left
-            if size > left:
-                raise _refused(f"it must have {size} bytes of samples, got {left}: it was cut off")
-            return found[b"fmt "], memoryview(content)[at : at + size]
-        found[name] = content[at : at + size]
+                size = available
+            if size > available:
+                raise _refused(
+                    f"it must have {size} bytes of samples, got {available}: it was cut off"
+                )
+            return chunks[b"fmt "], memoryview(content)[at : at + size]
+        chunks[name] = content[at : at + size]
         at += size + size % 2
     raise _refused("it has no format, or no samples behind it")
 
@@ -82,10 +84,10 @@ def _refused(why: str) -> InputError:
     return InputError(f"is no WAV file of PCM or float: {why}; save it as PCM of 16 bits")
 
 
-def _scaled(given: Any) -> FloatArray:
+def _scaled(raw: Any) -> FloatArray:
     with np.errstate(all="ignore"):  # floats that are too large or not numbers are rejected below
-        plain = given.astype(np.float32)
-    if given.dtype == np.uint8:
+        plain = raw.astype(np.float32)
+    if raw.dtype == np.uint8:
         return np.asarray((plain - 128) / 128)
-    full = 1.0 if given.dtype.kind == "f" else -float(np.iinfo(given.dtype).min)
+    full = 1.0 if raw.dtype.kind == "f" else -float(np.iinfo(raw.dtype).min)
     return np.asarray(plain / full)

@@ -275,11 +275,11 @@ def _check_wiring(validation: RigValidation, actuators: ActuatorKeys) -> None:
     for name, keys in actuators.items():
         amplifier, channel = keys.get("amplifier"), keys.get("channel")
         if amplifier is not None and amplifier not in amplifiers:
-            known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
+            names = ", ".join(key_name((key,)) for key in amplifiers) or "none"
             validation.add(
                 ("eras", name, "amplifier"),
                 f"unknown amplifier {amplifier}; {did_you_mean(amplifier, amplifiers)}"
-                f"known: {known}",
+                f"known: {names}",
             )
         if amplifier is None or channel is None:
             continue

@@ -26,6 +26,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
+from itertools import chain
 from typing import Any, ClassVar, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
@@ -127,8 +128,8 @@ class Source(ABC):
             return np.ones(np.shape(frequencies), dtype=complex)
         measured = [frequency for frequency, _, _ in self.gains]
         values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
-        found = np.interp(np.abs(frequencies), measured, values)
-        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+        gains = np.interp(np.abs(frequencies), measured, values)
+        return np.asarray(np.where(np.asarray(frequencies) < 0, gains.conj(), gains))
 
     @abstractmethod
     def force(self, omega: FloatArray) -> ComplexArray:
@@ -375,12 +376,12 @@ def with_patches(
     for number, ((x, y), load) in enumerate(zip(contacts, loads, strict=True)):
         if load > MAX_FINGER_LOAD:
             wide = math.sqrt(load / HAND_LOAD)
-            places[number], *others = [
+            places[number], *patches = [
                 (min(max(x + wide * a, 0.0), size[0]), min(max(y + wide * b, 0.0), size[1]))
                 for a, b in HAND_PATCHES
             ]
-            places += others
-            by += [load] * len(others)
+            places += patches
+            by += [load] * len(patches)
     return places, by
 
 
@@ -450,7 +451,7 @@ Support: TypeAlias = Source | PointLoad | FingertipLoad
 def feet_of(loads: Iterable[Support]) -> tuple[int, ...]:
     """Numbers of the loads that are feet, in their order."""
     # A diagnosis tries a fingertip among them, which is not a foot.
-    return tuple(n for n, each in enumerate(loads) if getattr(each, "is_foot", False))
+    return tuple(n for n, load in enumerate(loads) if getattr(load, "is_foot", False))
 
 
 _Complex = TypeVar("_Complex", bound="np.complexfloating[Any, Any]")
@@ -458,20 +459,20 @@ _Complex = TypeVar("_Complex", bound="np.complexfloating[Any, Any]")
 
 def footprints_of(*attached: Iterable[Support]) -> FloatArray:
     """Return footprints x, y, radius [m] of attachments, one group after the other, (n, 3)."""
-    places = [[each.x, each.y, each.foot] for group in attached for each in group]
+    places = [[source.x, source.y, source.foot] for source in chain.from_iterable(attached)]
     return np.array(places, dtype=float).reshape(-1, 3)
 
 
 def attached_stiffness(omega: FloatArray, *attached: Iterable[Support]) -> ComplexArray:
     """Dynamic stiffness [N/m] at omega (f,) [rad/s], one group after the other, (f, n)."""
-    found = [each.dynamic_stiffness(omega) for group in attached for each in group]
-    return np.array(found, dtype=complex).reshape(-1, len(omega)).T.copy()
+    stiffnesses = [source.dynamic_stiffness(omega) for source in chain.from_iterable(attached)]
+    return np.array(stiffnesses, dtype=complex).reshape(-1, len(omega)).T.copy()
 
 
 def drive_forces(omega: FloatArray, sources: Sequence[Source]) -> ComplexArray:
     """Force of each source at full level [N] at omega (f,) [rad/s], (f, sources)."""
-    found = [each.force(omega) for each in sources]
-    return np.array(found, dtype=complex).reshape(-1, len(omega)).T.copy()
+    forces = [source.force(omega) for source in sources]
+    return np.array(forces, dtype=complex).reshape(-1, len(omega)).T.copy()
 
 
 def unit_accelerations(
@@ -538,8 +539,8 @@ def edge_points(plate: Plate, count: int) -> Iterator[tuple[float, float, float]
     ):
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
             at = along * (1 + node) / 2
-            for other in (0.0, across):
-                yield (*((at, other) if is_along_x else (other, at)), along * weight / 2)
+            for edge in (0.0, across):
+                yield (*((at, edge) if is_along_x else (edge, at)), along * weight / 2)
 
 
 def least_points(plate: Plate, frequency: float) -> int:

@@ -65,16 +65,16 @@ class Balance:
         """
         edges = self.edges
         holding = -self.weight * _distances(edges, self.centre)  # N m, about each edge
-        least: tuple[float, Point] | None = None
+        smallest: tuple[float, Point] | None = None
         for point in points:
             levers = _distances(edges, point)
             is_outside = levers > 0
             if not is_outside.any():
                 continue
             force = float(np.min(holding[is_outside] / levers[is_outside]))
-            if least is None or force < least[0]:
-                least = force, point
-        return least
+            if smallest is None or force < smallest[0]:
+                smallest = force, point
+        return smallest
 
 
 def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoad] = ()) -> Balance:

@@ -184,8 +184,8 @@ class Exciter(Source):
     @property
     def fields(self) -> Mapping[str, str]:
         """Suspension, coil, magnet and force factor."""
-        own = {kind: kind for kind in ("stiffness", "damping", "magnet_mass", "force_factor")}
-        return own | {"bolt_mass": "coil_mass"}
+        names = {kind: kind for kind in ("stiffness", "damping", "magnet_mass", "force_factor")}
+        return names | {"bolt_mass": "coil_mass"}
 
     def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
         """Changes of D and of the force: dS makes T² dS and T² dS base, as that is defined.
@@ -197,8 +197,8 @@ class Exciter(Source):
         electric = 2j * w * self.force_factor**2 / self._impedance(w)
 
         def by_spring(change: ComplexArray | float) -> tuple[ComplexArray, ComplexArray]:
-            found = share**2 * change
-            return np.asarray(found), np.asarray(found * base)
+            stiffness_change = share**2 * change
+            return np.asarray(stiffness_change), np.asarray(stiffness_change * base)
 
         by_factor, of_force = by_spring(electric)
         return {

@@ -4,7 +4,7 @@ An installed package adds a material through an entry point of the group `era_ha
 that refers to a `KnownMaterial` with that name; rig files, their schema and `era plate materials`
 then include it.
 
-Moduli of plywood are those of its veneers: E of the grain where it runs along, and none across it
+Moduli of plywood follow from its veneers, which have E along their grain, and none across it
 (Handbook of Finnish Plywood), so that in bending, with the cross veneers between heights a and b
 from the middle, E2 h³ = 8 E sum (b³ - a³) and E1 + E2 = E.
 
@@ -147,11 +147,11 @@ class KnownMaterial:
         """
         import numpy as np  # which plug-ins of materials do without
 
-        found = self.by_kelvin * (temperature - STANDARD_TEMPERATURE)
+        change = self.by_kelvin * (temperature - STANDARD_TEMPERATURE)
         if self.by_moisture:
             now, standard = np.interp([humidity, STANDARD_HUMIDITY], *_MOISTURE).tolist()
-            found += (self.by_moisture - 1 / (1 + standard)) * (now - standard)
-        return found
+            change += (self.by_moisture - 1 / (1 + standard)) * (now - standard)
+        return change
 
 
 STANDARD_TEMPERATURE, STANDARD_HUMIDITY = 20.0, 0.65

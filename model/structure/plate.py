@@ -631,8 +631,8 @@ def equivalent_plate(
     length, width [m]. It keeps the laminate if its layers are solved individually, i.e. unless they
     slide or there is a single elastic layer.
     """
-    first, *others = laminate.layers
-    if not others and first.is_elastic:
+    first, *further = laminate.layers
+    if not further and first.is_elastic:
         return Plate(length, width, first.thickness, first.material, loss_factor)
     plate = _homogeneous(laminate, bending(laminate, frequency), length, width, loss_factor)
     if laminate.bond is Bond.NONE:

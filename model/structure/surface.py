@@ -188,18 +188,18 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     is_rigid = frequencies < RIGID_FREQUENCY
     elastic, ratios = w[:, ~is_rigid], read.damping_ratios[order][~is_rigid]
     size = np.sqrt((elastic**2).mean(axis=0))
-    seen = size > _SEEN * np.median(size) if len(size) else np.empty(0, dtype=bool)
-    if seen.sum() < _FEWEST or len(w) < _FEWEST:
+    is_seen = size > _SEEN * np.median(size) if len(size) else np.empty(0, dtype=bool)
+    if is_seen.sum() < _FEWEST or len(w) < _FEWEST:
         raise InputError(
             f"{file}: modes must be {_FEWEST} elastic ones or more that move along {normal}, at "
-            f"{_FEWEST} nodes or more, got {seen.sum()} at {len(w)}; export more, or give "
+            f"{_FEWEST} nodes or more, got {is_seen.sum()} at {len(w)}; export more, or give "
             "surface.normal"
         )
     # Mixtures of rigid motions that go along the normal; nothing would hold the others.
     _, sizes, mixtures = np.linalg.svd(w[:, is_rigid], full_matrices=False)
     held = sizes > _HELD * sizes.max(initial=0.0)
-    rigid, others = int(held.sum()), [a for a in range(3) if a != axis]
-    places = read.nodes[:, others] if read.places is None else read.places
+    rigid, in_plane = int(held.sum()), [a for a in range(3) if a != axis]
+    places = read.nodes[:, in_plane] if read.places is None else read.places
     points = places - places.min(axis=0)
     if not np.ptp(points, axis=0).all():
         raise InputError(
@@ -208,9 +208,9 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
         )
     return SurfaceShapes(
         points,
-        np.concatenate([np.zeros(rigid), frequencies[~is_rigid][seen]]),
-        np.hstack([w[:, is_rigid] @ mixtures[held].T, elastic[:, seen]]),
-        np.concatenate([np.full(rigid, math.nan), ratios[seen]]),
+        np.concatenate([np.zeros(rigid), frequencies[~is_rigid][is_seen]]),
+        np.hstack([w[:, is_rigid] @ mixtures[held].T, elastic[:, is_seen]]),
+        np.concatenate([np.full(rigid, math.nan), ratios[is_seen]]),
         rigid,
         _mass(along[:, is_rigid]),
         np.ptp(points, axis=0),
@@ -226,8 +226,8 @@ def _rigid_motions(nodes: FloatArray, normals: FloatArray, axis: int) -> FloatAr
     arms = nodes - nodes.mean(axis=0)
     rotations = [
         (np.cross(direction, arms) * normals).sum(axis=1)
-        for other, direction in enumerate(np.eye(3))
-        if other != axis
+        for number, direction in enumerate(np.eye(3))
+        if number != axis
     ]
     return np.column_stack([translation, *rotations])
 
@@ -238,9 +238,9 @@ def evenly_spaced(points: FloatArray, count: int) -> FloatArray:
     size = math.sqrt(float(np.prod(np.ptp(points, axis=0))) / count)
     while len(first) > count:
         cells = np.floor(points[first] / size).astype(int)
-        _, own = np.unique(cells, axis=0, return_index=True)
-        if len(own) <= count:
-            first = first[own]
+        _, chosen = np.unique(cells, axis=0, return_index=True)
+        if len(chosen) <= count:
+            first = first[chosen]
         size *= 1.05
     return np.sort(first)
 
@@ -252,8 +252,8 @@ def _normals(nodes: FloatArray, axis: int) -> FloatArray:
 
     _, near = cKDTree(nodes).query(nodes, k=min(_BESIDE, len(nodes)))
     beside = nodes[near] - nodes[near].mean(axis=1, keepdims=True)
-    found = np.linalg.svd(beside)[2][:, 2]
-    return np.asarray(found * np.where(found[:, [axis]] < 0, -1.0, 1.0))
+    normals = np.linalg.svd(beside)[2][:, 2]
+    return np.asarray(normals * np.where(normals[:, [axis]] < 0, -1.0, 1.0))
 
 
 def _mass(rigid: FloatArray) -> float:
@@ -281,12 +281,12 @@ def rings_of(faces: Iterable[Sequence[int]], points: FloatArray) -> Rings:
     while beside:
         ring = [min(beside)]
         while nexts := beside.get(ring[-1]):
-            after = nexts.pop()
-            beside[after].remove(ring[-1])
-            ring.append(after)
-        for each in ring:
-            if not beside.get(each, True):
-                del beside[each]
+            next_node = nexts.pop()
+            beside[next_node].remove(ring[-1])
+            ring.append(next_node)
+        for node in ring:
+            if not beside.get(node, True):
+                del beside[node]
         rings.append(tuple((float(x), float(y)) for x, y in points[ring[:-1]]))
     return tuple(rings)
 
@@ -311,19 +311,19 @@ def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float
     Its modes are N(f) = 1.25 S / 2 sqrt(mu / D) f. mass [kg]: as stated, None to use that of the
     modes; raises InputError if both contradict each other, and without either.
     """
-    own = shapes.mass
-    if mass is None and math.isnan(own):
+    modal_mass = shapes.mass
+    if mass is None and math.isnan(modal_mass):
         raise InputError(
             "mass must be stated for modes without an even rigid motion, got none; add the mass "
             "that moves along the normal"
         )
-    if mass is not None and abs(own / mass - 1) > _SAME_MASS:
+    if mass is not None and abs(modal_mass / mass - 1) > _SAME_MASS:
         raise InputError(
-            f"mass must match the modes, {own:.4g} kg, got {mass:.4g} kg; check the units of "
-            "the file and its modal masses, or leave it out"
+            f"mass must match the modes, {modal_mass:.4g} kg, got {mass:.4g} kg; check the units "
+            "of the file and its modal masses, or leave it out"
         )
     elastic, area = shapes.frequencies[shapes.rigid :], float(np.prod(shapes.size))
-    mu = (own if mass is None else mass) / area
+    mu = (modal_mass if mass is None else mass) / area
     rigidity = mu / (2 * len(elastic) / (EDGES * elastic[-1] * area)) ** 2
     ratios = shapes.damping_ratios[np.isfinite(shapes.damping_ratios)]
     return (
@@ -336,7 +336,7 @@ def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float
 def deviating_losses(shapes: SurfaceShapes, loss_factor: float) -> tuple[tuple[float, float], ...]:
     """Return damping differences of the lowest elastic modes from a plate's (`mode_deviations`)."""
     ratios = shapes.damping_ratios[shapes.rigid :][:MAX_DEVIATING]
-    known = np.where(ratios > 0, 2 * ratios, loss_factor) / max(loss_factor, 1e-12)
-    if np.abs(known - 1).max() < _SAME_LOSS:
+    factors = np.where(ratios > 0, 2 * ratios, loss_factor) / max(loss_factor, 1e-12)
+    if np.abs(factors - 1).max() < _SAME_LOSS:
         return ()
-    return tuple((0.0, float(each)) for each in np.log(known))
+    return tuple((0.0, float(factor)) for factor in np.log(factors))

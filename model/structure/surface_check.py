@@ -149,8 +149,8 @@ def _pairs(modes: ModeShapes) -> tuple[FloatArray, FloatArray]:
     sizes = np.outer(squares, squares)
     # Modes within the surface have rounding errors instead of a shape along the normal.
     is_seen = squares > _SEEN**2 * np.median(squares)
-    both = np.outer(is_seen, is_seen) & (sizes > 0)
-    alike = np.divide(products**2, sizes, out=np.zeros_like(sizes), where=both)
+    pairs = np.outer(is_seen, is_seen) & (sizes > 0)
+    alike = np.divide(products**2, sizes, out=np.zeros_like(sizes), where=pairs)
     # Rigid-body modes have the same frequency apart from rounding.
     frequencies = np.where(modes.frequencies < RIGID_FREQUENCY, 0.0, modes.frequencies)
     higher = np.maximum.outer(frequencies, frequencies)

@@ -1,12 +1,13 @@
 """Localization table: the data for patterns that one finger feels and others do not.
 
-It contains the modes of a plate on a raster. From these follow the fields of the ERAs at all drive
+It contains the modes of a plate on a sampling grid. Modes give the fields of the ERAs at all drive
 frequencies, with any fingers on the plate and for any plate within the rig's uncertainty, so that
-any fingertips can be queried in any drive mode.
+any fingertips can be queried in any drive mode. The table itself has no drive mode;
+`LocalizationTable.drive_mode` is the default of a query.
 
 Lagrange polynomials over six points of the raster (quintic) at a spacing of a twentieth of the
 shortest bending wavelength interpolate a field within 1e-4. The points of a fingertip are then one
-small matrix product, whatever the mesh.
+small matrix product, for any mesh.
 """
 
 import math
@@ -81,7 +82,7 @@ MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
 PATCH = 6  # points along a side of an interpolation, at least
 
 _OBJECT_PLACES = Grid(6, 5)
-"""Cells in whose middles an object may lie that the rig's uncertainty expects."""
+"""Cells whose centers are the positions of an object that the rig's uncertainty expects."""
 
 OBJECT_FACTOR = 6.0
 """Factor on the mean square change of fields by an object, which is far larger near fingers and
@@ -112,7 +113,8 @@ class Raster:
         """Raster for bending waves up to a frequency [Hz]."""
         wanted = plate.bending_wavelength(frequency_max) / POINTS_PER_WAVELENGTH
         spacing = min(max(wanted, MIN_SPACING), MAX_SPACING)
-        nx, ny = (max(PATCH, math.ceil(side / spacing) + 1) for side in (plate.length, plate.width))
+        nx = max(PATCH, math.ceil(plate.length / spacing) + 1)
+        ny = max(PATCH, math.ceil(plate.width / spacing) + 1)
         return cls(nx, ny, plate.length, plate.width)
 
     @property
@@ -141,23 +143,25 @@ class Raster:
             centres, length=self.length, width=self.width, rule=FIVE_AND_FINE
         )
         index, interpolation = self._patches(centres, points)
-        found = interpolation @ values.take(index, axis=0)
+        shapes = interpolation @ values.take(index, axis=0)
         few, fine = weights.astype(np.float32)
         return FingertipShapes(
-            np.ascontiguousarray(found[:, :_FEW]),
-            np.ascontiguousarray(found[:, _FEW:]),
+            np.ascontiguousarray(shapes[:, :_FEW]),
+            np.ascontiguousarray(shapes[:, _FEW:]),
             few[:, :_FEW],
             fine[:, _FEW:],
         )
 
     def at(self, values: Float32Array, points: FloatArray) -> Float32Array:
-        """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
+        """Return values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
 
-        At footprints (n, 3) their means.
+        At footprints (n, 3), the means over their discs.
         """
         if points.shape[1] == 3:
-            each = partial(self.at, values)
-            return mean_over(each, points, length=self.length, width=self.width).astype(np.float32)
+            field_at = partial(self.at, values)
+            return mean_over(field_at, points, length=self.length, width=self.width).astype(
+                np.float32
+            )
         index, weights = self._patches(points, points[:, None, :])
         return np.asarray((weights @ values[index])[:, 0])
 
@@ -188,11 +192,11 @@ class Raster:
         (2, 1, powers, powers); the shorter side's are padded with zeros.
         """
         side = self.patch
-        found = np.zeros((2, 1, max(side), max(side)))
+        coefficients = np.zeros((2, 1, max(side), max(side)))
         for axis, count in enumerate(side):
             powers = np.vander(np.linspace(-1, 1, count), increasing=True)
-            found[axis, 0, :count, :count] = np.linalg.inv(powers)
-        return found
+            coefficients[axis, 0, :count, :count] = np.linalg.inv(powers)
+        return coefficients
 
     def _patches(self, centres: FloatArray, points: FloatArray) -> tuple[IntArray, Float32Array]:
         """Raster points around centers (k, 2), and their weights at points (k, p, 2) nearby.
@@ -213,9 +217,9 @@ class Raster:
 
 @dataclass(frozen=True, eq=False)
 class FingertipShapes:
-    """Shapes (k, p, r) under k fingertips and weights (k, p) of the points in the mean over each.
+    """Shapes (k, p, r) under k fingertips, and weights (k, p) of the points in a fingertip's mean.
 
-    At few points for searches and at fine ones for figures; the center comes first.
+    At few points for searches, and at fine ones for predictions; the center comes first.
     """
 
     few: Float32Array
@@ -225,7 +229,7 @@ class FingertipShapes:
 
 
 _EDGE = 0.05
-"""Share of each side at its ends in which errors of exciters' fields do not count."""
+"""Fraction of the plate's sides, at each end, in which errors of exciters' fields do not count."""
 
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 """Drive frequencies [Hz] of a table by default, the paper's among them.
@@ -236,11 +240,14 @@ Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long.
 PAPER_GRID = Grid(12, 9)
 
 SAME_FREQUENCY = 1e-3
-"""Distance [Hz] of two frequencies that are one."""
+"""Difference [Hz] below which two frequencies are equal."""
 
-BACKGROUND_CELL, CELLS_PER_WAVELENGTH = 0.0254, 4
-"""Largest side [m] of the cells by whose centers the power of the plate around targets counts, that
-of the founding paper's cells; and how many a bending wave has at least."""
+BACKGROUND_CELL = 0.0254
+"""Largest side [m] of the cells at whose centers the power around targets is computed, the same as
+in the founding paper."""
+
+CELLS_PER_WAVELENGTH = 4
+"""Minimum number of these cells for each bending wavelength."""
 
 
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
@@ -313,22 +320,20 @@ class LocalizationTable:
         return eras * f + math.comb(eras, 2) * f**2
 
     def with_clocks(self, clocks: ClockErrors) -> "LocalizationTable":
-        """The table for amplifiers whose clocks are off; takes no time, all is shared."""
+        """Return the table for amplifiers with clock errors; fast, since it shares all data."""
         if clocks == self.clocks:
             return self
-        found = replace(self, clocks=clocks)
-        vars(found).update(vars(self) | vars(found))
-        vars(found).pop("power_shares", None)
-        return found
+        table = replace(self, clocks=clocks)
+        vars(table).update(vars(self) | vars(table))
+        vars(table).pop("power_shares", None)
+        return table
 
     def unit_fields(
         self, points: FloatArray, *, contacts: Sequence[Point] = (), loads: Sequence[float] = ()
     ) -> Complex64Array:
         """Acceleration [m/s²] at points (p, 2) [m] by each ERA alone at full stroke, (f, eras, p).
 
-        Of exciters at `highest_drives`.
-
-        contacts, loads: see `amplitudes`.
+        Exciters play at `highest_drives`. contacts, loads: see `amplitudes`.
         """
         shapes = self.raster.at(self.shapes, points)
         return np.ascontiguousarray(self._modal_fields(contacts, loads) @ shapes.T)
@@ -353,20 +358,24 @@ class LocalizationTable:
     def driven(
         self, excitation: Excitation, fields: Complex64Array
     ) -> tuple[FloatArray, Complex64Array]:
-        """Frequencies (k,) [Hz] of an excitation, and its field by unit fields (f, eras, ...)."""
+        """Return the frequencies (k,) [Hz] of an excitation and its field.
+
+        fields (f, eras, ...): of each ERA alone at full stroke.
+        """
         frequencies, bases = base_amplitudes(excitation, self.eras)
         rows = self.rows_of(frequencies)
         weights = (bases / self.highest_drives[rows]).astype(np.complex64)
         return frequencies, (weights[:, None] @ fields[rows])[:, 0]
 
     def rows_of(self, frequencies: FloatArray) -> IntArray:
-        """Rows (k,) of frequencies (k,) [Hz]; raises InputError for any but the table's own."""
+        """Return the rows (k,) of frequencies (k,) [Hz]; raises InputError for a frequency that is
+        not in the table."""
         rows = np.abs(np.subtract.outer(frequencies, self.frequencies)).argmin(axis=1)
-        for asked, nearest in zip(frequencies.tolist(), self.frequencies[rows], strict=True):
-            if not abs(asked - nearest) <= SAME_FREQUENCY:
+        for frequency, nearest in zip(frequencies.tolist(), self.frequencies[rows], strict=True):
+            if not abs(frequency - nearest) <= SAME_FREQUENCY:
                 raise InputError(
                     f"frequency of a tone must be in the table (nearest: {nearest:g} Hz), "
-                    f"got {asked:g} Hz; build a table with it: era table build "
+                    f"got {frequency:g} Hz; build a table with it: era table build "
                     "--frequencies"
                 )
         return np.asarray(rows)
@@ -407,23 +416,18 @@ class LocalizationTable:
 
     @cached_property
     def in_time(self) -> PlateInTime:
-        """The plate on its ERAs in time, without fingers."""
+        """The plate on its ERAs in the time domain, without fingers."""
         return self.in_time_under(())
 
     def in_time_under(self, contacts: Sequence[Point], loads: Sequence[float] = ()) -> PlateInTime:
-        """The plate on its ERAs in time with fingers at contacts [m]; takes some milliseconds.
+        """Return the plate on its ERAs in the time domain, with fingers at contacts [m].
 
-        loads: of each relative to the rig's fingertip, empty for 1.
+        Takes some milliseconds. loads: relative to the rig's fingertip, empty if all are 1.
         """
         fingers = fingertip_loads(self.fingertip, contacts, loads)
         shapes = self.shapes_at(contacts if fingers else ())
         return plate_in_time(
-            ReducedPlate(
-                self.plate,
-                self.omega,
-                self.losses,
-                at=self.shapes_at,
-            ),
+            ReducedPlate(self.plate, self.omega, self.losses, at=self.shapes_at),
             self.eras,
             loads=self.masses,
             contacts=fingers,
@@ -442,12 +446,13 @@ class LocalizationTable:
 
     @cached_property
     def sensitivities(self) -> Float32Array:
-        """How much higher amplitudes are to the thresholds of each set than the first, (s, f)."""
-        found = sensitivities(self.frequencies, self.threshold_sets, self.threshold)
-        return found.astype(np.float32)
+        """Factor of amplitudes relative to the thresholds of each set, compared with the first set,
+        (s, f)."""
+        factors = sensitivities(self.frequencies, self.threshold_sets, self.threshold)
+        return factors.astype(np.float32)
 
     def levels_by_set(self, level_db_sl: float, excitation: Excitation) -> FloatArray:
-        """A level of an excitation by each set of thresholds (s,), at least [dB SL]."""
+        """Return the lowest level [dB SL] of an excitation for each threshold set, (s,)."""
         played = np.array([tone.frequency for tone in excitation.values()])
         factors = sensitivities(played, self.threshold_sets, self.threshold)
         return level_db_sl + decibels(factors.min(axis=1))
@@ -460,21 +465,21 @@ class LocalizationTable:
         """
         twice = 2 * self.frequencies
         highest = highest_known(self.threshold)
-        found = detection_threshold(np.minimum(twice, highest), self.threshold)
-        return np.where(twice <= highest, found, np.inf).astype(np.float32)
+        thresholds = detection_threshold(np.minimum(twice, highest), self.threshold)
+        return np.where(twice <= highest, thresholds, np.inf).astype(np.float32)
 
     @cached_property
     def compared_harmonic_thresholds(self) -> Float32Array:
         """Thresholds at twice all frequencies for comparing candidates, (f,).
 
-        As low as in any set relative to its threshold at the tone; weights are searched with the
-        rig's own.
+        The lowest of all sets, relative to the set's threshold at the tone; the search for weights
+        uses the rig's own.
         """
         return np.asarray(self.harmonic_thresholds / self._harmonic_excess.max(axis=0))
 
     @cached_property
     def harmonic_sensitivities(self) -> Float32Array:
-        """As `sensitivities`, of harmonics to `compared_harmonic_thresholds`, (s, f)."""
+        """Same as `sensitivities`, for harmonics and `compared_harmonic_thresholds`, (s, f)."""
         excess = self._harmonic_excess
         return np.asarray(self.sensitivities * excess / excess.max(axis=0))
 
@@ -485,24 +490,25 @@ class LocalizationTable:
         Beyond a set's data, its last threshold is used.
         """
         twice = np.minimum(2 * self.frequencies, min(map(highest_known, self.threshold_sets)))
-        found = sensitivities(twice, self.threshold_sets, self.threshold) / self.sensitivities
-        return found.astype(np.float32)
+        excess = sensitivities(twice, self.threshold_sets, self.threshold) / self.sensitivities
+        return excess.astype(np.float32)
 
     @cached_property
     def modal_dispersion(self) -> Dispersion | None:
-        """Change of the eigenvalues with frequency, None without any."""
+        """Change of the eigenvalues with frequency; None if they are constant."""
         if not len(self.dispersion_frequencies):
             return None
         return Dispersion(self.dispersion_frequencies, self.dispersion)
 
     @cached_property
     def attached(self) -> AttachedPlate:
-        """The plate with its ERAs and masses at the drive frequencies, by `highest_drives`."""
+        """The plate with its ERAs and masses at the drive frequencies, driven at
+        `highest_drives`."""
         return self._attached(self.frequencies).driven_less(self.allowed_shares)
 
     @cached_property
     def allowed_shares(self) -> FloatArray:
-        """Share of full level that all actuators may play together in any phases, (f,)."""
+        """Fraction of full level that all actuators can play together in any phases, (f,)."""
         if not self._is_limited:
             return np.ones(len(self.frequencies))
         return self.magnets.shares(self.frequencies)
@@ -514,7 +520,7 @@ class LocalizationTable:
 
     @cached_property
     def _is_limited(self) -> bool:
-        """Whether an excursion limits what any of its actuators plays."""
+        """Whether an excursion limits any of the actuators."""
         return any(math.isfinite(era.excursion) for era in self.eras)
 
     def excursion_of(self, drives: Iterable[tuple[Excitation, Sequence[Swing]]]) -> float:
@@ -526,18 +532,19 @@ class LocalizationTable:
         if not self._is_limited:
             return 0.0
         parts = dict[tuple[int, float], float]()
-        for number, (each, swings) in enumerate(drives):
-            for name, tone in each.items():
+        for number, (excitation, swings) in enumerate(drives):
+            for name, tone in excitation.items():
                 share = float(np.interp(tone.frequency, self.frequencies, self.allowed_shares))
                 for swing in swings:
                     share = min(share, share_along(self.magnets, tone.frequency, swing))
+                key = number, tone.frequency
                 part = tone.amplitude / self.full_levels[name] / share
-                parts[number, tone.frequency] = max(part, parts.get((number, tone.frequency), 0.0))
+                parts[key] = max(part, parts.get(key, 0.0))
         return sum(parts.values())
 
     @cached_property
     def highest_drives(self) -> FloatArray:
-        """Amplitude that each actuator may play at each frequency, of weight 1, (f, eras)."""
+        """Largest amplitude of each actuator at each frequency, for weight 1, (f, eras)."""
         return np.asarray(self.allowed_shares[:, None] * [*self.full_levels.values()])
 
     def _attached(self, frequencies: FloatArray) -> AttachedPlate:
@@ -556,26 +563,26 @@ class LocalizationTable:
 
     @property
     def on_eras(self) -> PlateOnEras:
-        """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
+        """The plate with its ERAs and masses eliminated, for all thicknesses that answers need."""
         return self._with_places[0]
 
     @cached_property
     def _with_places(self) -> tuple[PlateOnEras, FloatArray]:
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
-        found = PlateOnEras.of(self.attached, *sorted(counts))
+        plates = PlateOnEras.of(self.attached, *sorted(counts))
         if not self.uncertainty.place:
-            return found, np.zeros(found.plate.forces.shape)
-        by_field = [isinstance(each, Exciter) for each in self.eras]
+            return plates, np.zeros(plates.plate.forces.shape)
+        by_field = [isinstance(era, Exciter) for era in self.eras]
         # Without the edges, which bend most, and where few fingers rest.
         points = self.raster.points
         inner = (np.abs(points / points[-1] - 0.5) < 0.5 - _EDGE).all(axis=1)
         shapes = self.shapes[inner & self.plate.covers(points)]
         gram = np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
-        return with_places(found, self._shifts_of_eras, gram, by_field)
+        return with_places(plates, self._shifts_of_eras, gram, by_field)
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:
-        """The same at twice the drive frequencies, for the thicknesses listed first there."""
+        """Same as `on_eras` at twice the drive frequencies, for the first of its thicknesses."""
         twice = self._attached(2 * self.frequencies)
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.bases}
         driven = at_harmonics(twice, self.eras).driven_less(self.allowed_shares)
@@ -592,29 +599,32 @@ class LocalizationTable:
 
     @cached_property
     def field_error_power(self) -> Float32Array:
-        """The same over the plate, from discretization and the rig's uncertainty.
+        """Mean square error over the plate, from discretization and the rig's uncertainty.
 
-        Includes its `field`, and an object of its `foreign_mass`, averaged over possible positions.
+        Includes the uncertainty's `field`, and an object of its `foreign_mass`, averaged over
+        possible positions.
         """
         error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
         fields = self.on_eras.fields
-        found = error**2 * self._mean_square(fields)
-        if mass := self.uncertainty.foreign_mass:
-            D = object_load(mass).dynamic_stiffness(self.attached.omega).astype(np.complex64)
+        power = error**2 * self._mean_square(fields)
+        mass = self.uncertainty.foreign_mass
+        if mass:
+            stiffness = object_load(mass).dynamic_stiffness(self.attached.omega)
+            D = stiffness.astype(np.complex64)[:, None]
             places = self.shapes_at(_OBJECT_PLACES.centres(self.plate)).astype(np.float32)
-            for at in places[:, None]:
-                beside = TouchedPlate(self.on_eras, at, D[:, None], np.zeros(1, np.float32))
-                changed = self._mean_square(beside.coordinates() - fields)
-                found += changed * (OBJECT_FACTOR / len(places))
-        return np.asarray(found, dtype=np.float32)
+            for place in places[:, None]:
+                loaded = TouchedPlate(self.on_eras, place, D, np.zeros(1, np.float32))
+                change = self._mean_square(loaded.coordinates() - fields)
+                power += change * (OBJECT_FACTOR / len(places))
+        return np.asarray(power, dtype=np.float32)
 
     @property
     def _shifts_of_eras(self) -> FloatArray:
-        """By how much the shapes at ERAs change as these are off along x and y, (n, 2, r)."""
+        """Change of the shapes at ERAs for a position error along x and along y, (n, 2, r)."""
         distance = self.uncertainty.place
-        known, (length, width) = footprints_of(self.eras), self.raster.points[-1]
-        ends = np.repeat(known[:, None, None], 4, axis=1).reshape(len(known), 2, 2, -1)
-        for axis, side in enumerate((length, width)):
+        footprints = footprints_of(self.eras)
+        ends = np.repeat(footprints[:, None, None], 4, axis=1).reshape(len(footprints), 2, 2, -1)
+        for axis, side in enumerate(self.raster.points[-1]):
             ends[:, axis, :, axis] += [distance, -distance]
             ends[:, axis, :, axis].clip(0.0, side, out=ends[:, axis, :, axis])
         shapes = self.shapes_at(ends.reshape(-1, 3)).reshape(*ends.shape[:3], -1)
@@ -623,7 +633,7 @@ class LocalizationTable:
 
     @cached_property
     def search_error_power(self) -> Float32Array:
-        """The same with second harmonics, as if they were at the drive frequency: for searches."""
+        """`error_power` with second harmonics counted at the drive frequency, for searches."""
         if not self.uncertainty.harmonic:
             return self.error_power
         share = self.uncertainty.harmonic * (self.thresholds / self.harmonic_thresholds)[:, None]
@@ -641,11 +651,12 @@ class LocalizationTable:
 
     @cached_property
     def _everywhere(self) -> tuple[FloatArray, Complex64Array, Complex64Array]:
-        """Points (p, 2) [m] that tile the plate, fields there (f, eras, p), and power of all."""
+        """Centers (p, 2) [m] of cells that tile the plate, fields there (f, eras, p), and power."""
         wavelength = self.plate.bending_wavelength(float(self.frequencies[-1]))
         side = min(BACKGROUND_CELL, wavelength / CELLS_PER_WAVELENGTH)
-        sides = self.plate.length, self.plate.width
-        points = Grid(*(min(max(round(each / side), 1), 200) for each in sides)).centres(self.plate)
+        nx = min(max(round(self.plate.length / side), 1), 200)
+        ny = min(max(round(self.plate.width / side), 1), 200)
+        points = Grid(nx, ny).centres(self.plate)
         points = points[self.plate.covers(points)]
         fields = self.unit_fields(points)
         return points, fields, _power(fields)
@@ -653,14 +664,14 @@ class LocalizationTable:
     def _modal_fields(
         self, contacts: Sequence[Point], loads: Sequence[float] = ()
     ) -> Complex64Array:
-        """Accelerations of the reduced coordinates by each ERA at full stroke, (f, eras, r)."""
+        """Accelerations of the reduced coordinates due to each ERA at full stroke, (f, eras, r)."""
         if not contacts:
             return self.on_eras.fields
         centres = self.shapes_at(contacts).astype(np.float32)
         return touch(self.on_eras, centres, tuple(loads)).coordinates()
 
     def background(self, targets: Sequence[Point]) -> Complex64Array:
-        """Expected power of the plate beyond targets, without fingers on it, (f, eras, eras).
+        """Expected power of the untouched plate outside of the targets, (f, eras, eras).
 
         Includes clock errors, in addition to the nominal power.
         """
@@ -686,33 +697,41 @@ _FEW, _FINE = len(FIVE_POINTS.points), len(FINE_POINTS.points)
 
 def read_fingertips(table: LocalizationTable, places: Sequence[Point]) -> FingertipShapes:
     """Return shapes at fingertips centered at positions [m], with a C kernel if available."""
-    by = kernels()
-    if by is None:
+    compiled = kernels()
+    if compiled is None:
         return table.raster.fingertips(np.array(places), table.shapes)
-    on, k = given_raster(table), len(places)
-    at = array("d", chain.from_iterable(places))
-    sizes = (k, _FEW, on.r), (k, _FINE, on.r), (k, _FEW), (k, _FINE)
-    found = [np.empty(size, dtype=np.float32) for size in sizes]
-    to = [c_void_p(each.ctypes.data) for each in found]
-    run_kernel(by.library.fingertips_stage, on, c_void_p(at.buffer_info()[0]), k, *to)
-    return FingertipShapes(*found)
+    raster, k = given_raster(table), len(places)
+    centers = array("d", chain.from_iterable(places))
+    sizes = (k, _FEW, raster.r), (k, _FINE, raster.r), (k, _FEW), (k, _FINE)
+    results = [np.empty(size, dtype=np.float32) for size in sizes]
+    pointers = [c_void_p(result.ctypes.data) for result in results]
+    run_kernel(
+        compiled.library.fingertips_stage,
+        raster,
+        c_void_p(centers.buffer_info()[0]),
+        k,
+        *pointers,
+    )
+    return FingertipShapes(*results)
 
 
 def given_raster(table: LocalizationTable) -> GivenRaster:
-    """The raster of a table as kernels read it, kept with it."""
-    kept = _kept.get(table)
-    if kept is not None:
-        return kept
+    """Return the raster of a table as kernels read it, made once for each table."""
+    cached = _given_rasters.get(table)
+    if cached is not None:
+        return cached
     raster = table.raster
-    found = GivenRaster(raster.nx, raster.ny, *raster.patch, table.shapes.shape[1], _FEW, _FINE)
-    found.length, found.width, found.radius = raster.length, raster.width, FINGERTIP_RADIUS
-    found.point(
+    given = GivenRaster(raster.nx, raster.ny, *raster.patch, table.shapes.shape[1], _FEW, _FINE)
+    given.length = raster.length
+    given.width = raster.width
+    given.radius = FINGERTIP_RADIUS
+    given.point(
         points=FIVE_AND_FINE.points,
         weights=FIVE_AND_FINE.weights,
         nodes=GAUSS_LEGENDRE,
         shapes=table.shapes,
     )
-    return _kept.setdefault(table, found)
+    return _given_rasters.setdefault(table, given)
 
 
-_kept: WeakKeyDictionary[LocalizationTable, GivenRaster] = WeakKeyDictionary()
+_given_rasters: WeakKeyDictionary[LocalizationTable, GivenRaster] = WeakKeyDictionary()

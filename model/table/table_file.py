@@ -1,10 +1,10 @@
 """Build, cache and read localization tables.
 
 A table is bit-identical for any number of processes, and cached between runs in the user's cache
-folder. Its file is an uncompressed .npz with a JSON header. Members are `header` (JSON as bytes)
-and the arrays of `LocalizationTable` under their own names. The header contains the format version,
-the plate's fingerprint, the inputs of the table, and a SHA-256 of the content, so that a damaged or
-foreign file is rejected before use.
+folder. The table file is an uncompressed .npz with a JSON header. Members are `header` (JSON as
+bytes) and the arrays of `LocalizationTable` under their own names. The header contains the format
+version, the plate's fingerprint, the inputs of the table, and a SHA-256 of the content, so that a
+damaged or foreign file is rejected before use.
 """
 
 import hashlib
@@ -143,29 +143,14 @@ def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable
     path = expect_path(path, what="path")
     if rig is not None:
         expect_instance(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    content = _read_content(path)
     rebuild = f"build it again, with the options it had: era table build RIG -o {path}"
-    try:
-        content = read_arrays(path, _DTYPES, max_bytes=_MAX_BYTES)
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such table; build one: era table build RIG -o {path.with_suffix('.npz')}"
-        ) from None
-    except UNREADABLE as error:
-        why: object = error
-        if isinstance(error, BadZipFile):
-            why = "cut off or damaged" if begins_with(path, ZIP) else "not a .npz file"
-        elif isinstance(error, OSError):
-            why = error.strerror or error
-        raise InputError(
-            f"{path}: not a readable localization table ({why}); give a file of era table build, "
-            "or build it again"
-        ) from error
     try:
         text = content.pop("header").tobytes()
         header = _WholeHeader.model_validate_json(text)
     except ValidationError as error:
-        where, said = first_problem(error)
-        raise InputError(f"{path}: bad header ({where or 'header'}: {said}); {rebuild}") from error
+        key, problem = first_problem(error)
+        raise InputError(f"{path}: bad header ({key or 'header'}: {problem}); {rebuild}") from error
     if header.format != FORMAT or header.format_version != FORMAT_VERSION:
         raise InputError(
             f"{path}: format must be {FORMAT!r} version {FORMAT_VERSION}, got {header.format!r} "
@@ -179,22 +164,51 @@ def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable
         raise InputError(f"{path}: {error}; {rebuild}") from error
     if table.fingerprint != header.fingerprint:
         raise InputError(f"{path}: fingerprint does not match the plate of the file; {rebuild}")
-    if rig is not None and (different := differences(table, rig)):
-        more = len(different) - _MAX_SHOWN
-        raise InputError(
-            f"{path}: must be a table of this rig: {'; '.join(different[:_MAX_SHOWN])}"
-            f"{f'; and {more} more' if more > 0 else ''}; build it again: era table build RIG "
-            f"-o {path} {_options(table)}"
-        )
+    if rig is not None:
+        _check_is_of_rig(path, table, rig)
     return table
 
 
+def _read_content(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the header and the arrays of a table file; raises InputError."""
+    try:
+        return read_arrays(path, _DTYPES, max_bytes=_MAX_BYTES)
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: no such table; build one: era table build RIG -o {path.with_suffix('.npz')}"
+        ) from None
+    except UNREADABLE as error:
+        reason: object = error
+        if isinstance(error, BadZipFile):
+            reason = "cut off or damaged" if begins_with(path, ZIP) else "not a .npz file"
+        elif isinstance(error, OSError):
+            reason = error.strerror or error
+        raise InputError(
+            f"{path}: not a readable localization table ({reason}); give a file of era table "
+            "build, or build it again"
+        ) from error
+
+
+def _check_is_of_rig(path: Path, table: LocalizationTable, rig: Rig) -> None:
+    """Raise InputError with the keys in which a table is of another rig."""
+    different = differences(table, rig)
+    if not different:
+        return
+    keys = "; ".join(different[:_MAX_SHOWN])
+    if len(different) > _MAX_SHOWN:
+        keys += f"; and {len(different) - _MAX_SHOWN} more"
+    raise InputError(
+        f"{path}: must be a table of this rig: {keys}; build it again: era table build RIG "
+        f"-o {path} {_options(table)}"
+    )
+
+
 def _options(table: LocalizationTable) -> str:
-    """The options of `era table build` with which a table was built."""
-    f = [f"{each:g}" for each in table.frequencies]
+    """Return the options of `era table build` with which a table was built."""
+    words = [f"{frequency:g}" for frequency in table.frequencies]
     steps = np.diff(table.frequencies)
-    is_even = len(f) > 1 and np.allclose(steps, steps[0])
-    frequencies = f"{f[0]}:{f[-1]}:{steps[0]:g}" if is_even else ",".join(f)
+    is_even = len(words) > 1 and np.allclose(steps, steps[0])
+    frequencies = f"{words[0]}:{words[-1]}:{steps[0]:g}" if is_even else ",".join(words)
     return f"--mode {table.drive_mode} --grid {table.grid} --frequencies {frequencies}"
 
 
@@ -219,6 +233,24 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
         **arrays,
     )
     checked_mode(table.drive_mode)
+    _check_arrays(table)
+    _check_positions(table)
+    for threshold_set in table.threshold_sets:
+        check_has_threshold(table.frequencies, threshold_set)
+    # Rows are found by frequency with a binary search.
+    frequencies = table.frequencies
+    if not (len(frequencies) > 0 and frequencies[0] > 0 and (np.diff(frequencies) > 0).all()):
+        raise InputError("frequencies must be positive and ascend, at least one")
+    if frequencies.tolist() != header.frequencies_hz:
+        raise InputError("frequencies of header and table must be equal")
+    size = (table.raster.length, table.raster.width)
+    if size != (table.plate.length, table.plate.width):
+        raise InputError("raster and plate must have the same size")
+    return table
+
+
+def _check_arrays(table: LocalizationTable) -> None:
+    """Raise InputError for arrays of another shape, and for values out of bounds."""
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
     nodes = len(table.dispersion_frequencies)
     expected = {
@@ -241,21 +273,14 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
     for name in ("shapes", "attachment_shapes", "omega"):
         if np.abs(getattr(table, name)).max(initial=0) < 1 / _MAX_VALUE:
             raise InputError(f"{name} must not be zero everywhere")
-    places = [(each.x, each.y) for each in table.eras] + [(m.x, m.y) for m in table.masses]
-    for x, y in places:
+
+
+def _check_positions(table: LocalizationTable) -> None:
+    """Raise InputError for ERAs and masses beside the plate."""
+    for attachment in (*table.eras, *table.masses):
+        x, y = attachment.x, attachment.y
         if not (0 <= x <= table.plate.length and 0 <= y <= table.plate.width):
             raise InputError(f"ERAs and masses must be on the plate, got ({x:g}, {y:g}) m")
-    for each in table.threshold_sets:
-        check_has_threshold(table.frequencies, each)
-    # Rows are found by frequency with a binary search.
-    if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
-        raise InputError("frequencies must be positive and ascend, at least one")
-    if table.frequencies.tolist() != header.frequencies_hz:
-        raise InputError("frequencies of header and table must be equal")
-    size = (table.raster.length, table.raster.width)
-    if size != (table.plate.length, table.plate.width):
-        raise InputError("raster and plate must have the same size")
-    return table
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +296,7 @@ class TableProblem:
     grid: Grid
 
     def __post_init__(self) -> None:
-        """Refuse frequencies that make no table, and a table that would be too large to be read."""
+        """Reject invalid frequencies, and a table that would be too large."""
         frequencies = self.frequencies
         if len(frequencies) == 0 or not (np.isfinite(frequencies).all()):
             raise InputError("frequencies of a table must be finite numbers, at least one")
@@ -284,8 +309,8 @@ class TableProblem:
                 f"got {frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the "
                 "limits"
             )
-        for each in (self.rig.threshold, *self.rig.promised_thresholds):
-            check_has_threshold(frequencies, each)
+        for threshold_set in (self.rig.threshold, *self.rig.promised_thresholds):
+            check_has_threshold(frequencies, threshold_set)
         check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
         plate = self.rig.plate
         check_scales(plate, 1 + self.rig.uncertainty.frequency)
@@ -321,7 +346,7 @@ class TableProblem:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over everything that decides the numbers of the table, and their format."""
+        """SHA-256 of all inputs that determine the numbers of the table, and of the file format."""
         decisive = {
             "format": FORMAT_VERSION,
             "numerics": NUMERICS_VERSION,
@@ -363,15 +388,16 @@ def solve_table(
 ) -> LocalizationTable:
     """Solve modes and discretization error by several processes.
 
-    progress: called with the number of finished parts and the total; is_estimated: unless the error
-    is taken for none, which takes a tenth of the time. Raises InputError.
+    progress: called with the number of finished parts and the total; is_estimated: whether to
+    estimate the discretization error; an error of zero takes a tenth of the time. Raises
+    InputError.
     """
-    mode, error = checked_mode(drive_mode), _discretisation if is_estimated else _no_error
-    parts = dict(enumerate((error, _modes)))
+    mode = checked_mode(drive_mode)
+    parts = {0: _discretisation if is_estimated else _no_error, 1: _modes}
     solved: dict[str, Any] = {name: getattr(problem.rig, name) for name in PHYSICS}
     # A copy without cached properties, which cannot all be sent to a process.
-    found = on_processes(workers, _solve, replace(problem), parts)
-    for done, (_, arrays) in enumerate(found, start=1):
+    results = on_processes(workers, _solve, replace(problem), parts)
+    for done, (_, arrays) in enumerate(results, start=1):
         solved |= arrays
         progress(done, len(parts))
     return LocalizationTable(
@@ -396,8 +422,8 @@ def _modes(problem: TableProblem) -> Arrays:
     reduced = reduce_free_plate(problem.free_plate, attached)
     dispersion = reduced.dispersion
     if dispersion is None:
-        nothing = np.zeros((0, len(reduced.omega)), dtype=complex)
-        dispersion = Dispersion(np.empty(0), nothing)
+        no_dispersion = np.zeros((0, len(reduced.omega)), dtype=complex)
+        dispersion = Dispersion(np.empty(0), no_dispersion)
     return {
         "omega": reduced.omega,
         "losses": reduced.losses,

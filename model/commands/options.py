@@ -162,7 +162,7 @@ def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_js
 
 
 def next_line(*words: str | Path) -> str:
-    """Format the next command for the shell, with quotes where they are needed.
+    """Format the next command for the shell, with quotes if needed.
 
     If `era` is not on the PATH, the command starts with its path.
     """

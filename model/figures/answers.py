@@ -1,4 +1,4 @@
-"""Answers of a table: the level over the plate, the fingers and what they feel."""
+"""Answers of a table: the level over the plate, and the level and contrast at fingers."""
 
 import math
 from collections.abc import Iterable, Sequence

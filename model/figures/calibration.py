@@ -40,7 +40,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
 
 
 def _draw_responses(axes: Axes, calibration: Calibration, *, sensor: int, era: int) -> None:
-    """Draw the responses of one sensor to one ERA: rig file, calibrated rig and measurement."""
+    """Draw the responses of a sensor to an ERA: rig file, calibrated rig and measurement."""
     base_displacement = 1e-6  # m
     curves: tuple[tuple[str, NDArray[Any], dict[str, Any]], ...] = (
         ("rig file", calibration.before, {"color": "0.55", "lw": 1.0, "ls": "--"}),

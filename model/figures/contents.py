@@ -166,7 +166,7 @@ def _patch_centers(
     """Return the innermost point [cm] of every large patch without a finger.
 
     is_own (ny, nx): points at which one content is felt on its own; steps [cm]: spacing along x and
-    y; fingers: those that feel the content.
+    y; fingers: the fingers that feel the content.
     """
     step_x, step_y = steps
     patches, count = ndimage.label(is_own)

@@ -161,7 +161,7 @@ def _page_count(layout: tuple[int, int, float, float]) -> int:
 def _page(template: Template, box: Box, *, name: str, edge: float, scale: float = 1.0) -> Figure:
     """Draw a box of the board and the strip below it, within a white edge [mm].
 
-    scale: of the text; that of a large sheet is also read on a screen.
+    scale: of the text, larger on a large sheet, which is also read on a screen.
     """
     low, high, bottom, top = box
     strip_height = STRIP * scale

@@ -70,7 +70,7 @@ _REQUIRED = ("coil_mass", "weight", "force_factor", "resistance", "power", "reso
 """Keys that an exciter needs, from its type or given."""
 
 _FITTED_KEYS = {"resonance": "stiffness", "q": "damping"}
-"""Keys that a fit writes instead of those of a data sheet."""
+"""Keys that a fit writes, by the data-sheet key that they replace."""
 
 
 def _gains_of(rows: Sequence[GainRow] | None) -> tuple[Gain, ...]:

@@ -406,7 +406,7 @@ class PlateSection(Section):
         return Plate.loss_factor
 
     def keys_of(self, plate: Plate, laminate: Laminate | None) -> dict[KeyPath, Any]:
-        """Return the values of these keys, by path, for another plate; inverse of `build`.
+        """Return key values, by path, that describe another plate; inverse of `build`.
 
         laminate: from which that plate is built. It must have the form of this section: as many
         layers, the same air gap (if any), grain and bond.

@@ -33,7 +33,7 @@ from registry.plugins import did_you_mean
 RigValidation: TypeAlias = Validation[RigSection]
 
 ActuatorKeys: TypeAlias = Mapping[str, Mapping[str, Any]]
-"""Keys of each actuator by its name; see `_valid_keys`."""
+"""Keys of actuators by name; see `_valid_keys`."""
 
 
 class Alternative(NamedTuple):

@@ -28,7 +28,7 @@ def rig_schema() -> dict[str, Any]:
 
 
 def _without_requirements(schema: Any) -> Any:
-    """Return a JSON schema without required keys, in which null removes a key of the base."""
+    """Return a JSON schema without required keys; null removes a key of the base."""
     if isinstance(schema, list):
         return [_without_requirements(entry) for entry in schema]
     if not isinstance(schema, dict):

@@ -237,5 +237,5 @@ def _phase_warnings(era: Source, limits: GuardLimits) -> Iterator[str]:
 
 
 def _angle_between(row: Gain, next_row: Gain) -> float:
-    """Return the angle [rad] from the phase of one gain to the other, at most pi."""
+    """Return the angle [rad] between the phases of two gains, at most pi."""
     return abs(cmath.phase(cmath.rect(1, next_row[2] - row[2])))

@@ -130,7 +130,7 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
     """Return the rig-file keys that turn one rig into another one with the same ERAs, and no
     others.
 
-    A key to be removed is None.
+    None removes a key.
     """
     document = _document_of(before)
     section = Validation(document, RigSection).finish()
@@ -150,7 +150,7 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
 
 
 def _changed_values(before: Rig, after: Rig, section: RigSection) -> dict[KeyPath, Any]:
-    """Return the values that differ between two rigs, and those that replace other keys."""
+    """Return the values that differ between two rigs, and values that replace other keys."""
     always: set[KeyPath] = {("plate", "loss_factor")}
     for era in after.eras:
         always |= {("eras", era.name, key) for key in ACTUATOR_KINDS[type(era)].instead}
@@ -209,7 +209,7 @@ def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _name_below(output: Path, base: Path) -> str | None:
-    """Return the name of a base relative to the output's folder; None for a base outside of it."""
+    """Return the name of a base relative to the output's folder; None outside that folder."""
     folder = output.absolute().parent
     base_file = base.absolute()
     if not base_file.is_relative_to(folder):
@@ -328,8 +328,8 @@ def rig(
 
     amplifiers: default `{"main": {"url": "sim://"}}`, a simulated one, with the ERAs on its
     channels in order; uncertainty, fingertip: mappings, or an `Uncertainty` and a `Fingertip`;
-    fingertip="none" for massless fingers. An argument that is omitted or None stands for the
-    default of a file. Raises ConfigError with all problems, by argument and key.
+    fingertip="none" for massless fingers. An argument that is omitted or None has the default
+    of a file. Raises ConfigError with all problems, by argument and key.
 
     Example:
         >>> sheet = era.Plate(length=0.4, width=0.3, thickness="3 mm", material="aluminium")

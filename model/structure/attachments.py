@@ -687,7 +687,7 @@ def _attached(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return factors p (3, n), stiffness [N/m] and mass [kg] (n,) of all attachments.
 
-    In units of the plate's sides, in which both tilts have the size of the heave.
+    In units of the plate's sides, so that both tilts have the size of the heave.
     """
     attached = [*(era.support for era in eras), *loads]
     mounts = [(at.x, at.y, at.stiffness, at.mass) for at in attached]

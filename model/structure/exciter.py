@@ -138,7 +138,7 @@ class Exciter(Source):
         return np.asarray(spring * share - w**2 * self.coil_mass), np.asarray(by_voltage)
 
     def base(self, omega: FloatArray) -> ComplexArray:
-        """Motion Bl V / (Z omega² M) at full level by which errors of its spring change the force.
+        """Motion Bl V / (Z omega² M) at full level, with which spring errors change the force.
 
         A spring that is stiffer by dS acts with dS T² (base - w) [m]; 0 for a held magnet, whose
         spring is at rest.

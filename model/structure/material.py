@@ -120,7 +120,7 @@ class KnownMaterial:
     """Default loss factor of a plate if it exceeds 1 %, the value for a mounted panel's joints."""
 
     by_frequency: tuple[tuple[float, float, float], ...] = ()
-    """Frequency [Hz], factor of E and loss factor, as in a layer; empty if constant."""
+    """Frequency [Hz], factor of E and loss factor, same as for a layer; empty if constant."""
 
     by_thickness: Callable[[float], Material] | None = None
     """Material of a board by thickness [m]; `material` is then the one for a typical thickness."""

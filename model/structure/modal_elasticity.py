@@ -186,7 +186,7 @@ def _powers(plate: Plate, omega: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Discretisation(ABC):
-    """nx by ny elements, or polynomials of these degrees, over length by width [m]."""
+    """nx by ny elements, or polynomials of degrees nx and ny, over length by width [m]."""
 
     nx: int
     ny: int

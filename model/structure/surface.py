@@ -308,7 +308,7 @@ def is_within(outline: Rings, points: FloatArray) -> NDArray[np.bool_]:
 def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float, float]:
     """Return modulus [Pa], density [kg/m³] and loss factor of a surface's equivalent plate.
 
-    Its modes are N(f) = 1.25 S / 2 sqrt(mu / D) f. mass [kg]: as stated, None to use that of the
+    Its modes are N(f) = 1.25 S / 2 sqrt(mu / D) f. mass [kg]: as stated, None for the mass of the
     modes; raises InputError if both contradict each other, and without either.
     """
     modal_mass = shapes.mass

@@ -229,7 +229,7 @@ class FingertipShapes:
 
 
 _EDGE = 0.05
-"""Fraction of the plate's sides, at each end, in which errors of exciters' fields do not count."""
+"""Fraction of the plate's sides, at each end, where errors of exciters' fields do not count."""
 
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 """Drive frequencies [Hz] of a table by default, the paper's among them.
@@ -247,7 +247,7 @@ BACKGROUND_CELL = 0.0254
 in the founding paper."""
 
 CELLS_PER_WAVELENGTH = 4
-"""Minimum number of these cells for each bending wavelength."""
+"""Minimum number of cells for each bending wavelength."""
 
 
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:

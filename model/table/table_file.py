@@ -469,7 +469,7 @@ def cached_table(
     """Return a rig's table from the user's cache folder, built if it is not there, and its file.
 
     frequencies (f,) [Hz]: `default_drive_frequencies` if None. A damaged file is built again. The
-    file is None if the folder cannot be written.
+    file is None if the folder is not writable.
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)

@@ -7,8 +7,8 @@ Laminates, such as cover glass on adhesive on a panel. Every layer bends, stretc
 individually. Displacements along the plate are continuous from layer to layer and linear within
 each (a layerwise theory of first order: Reddy, Mechanics of Laminated Composite Plates and Shells,
 2nd ed., ch. 12); the deflection is the same through the thickness. Soft adhesives between stiff
-layers then shear as Kerwin (J. Acoust. Soc. Am. 31 (1959) 952) and Mead and
-Markus (J. Sound Vib. 10 (1969) 163) predict, more the shorter the wave. With stiff adhesives it becomes
+layers then shear as Kerwin (J. Acoust. Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound Vib.
+10 (1969) 163) predict, more the shorter the wave. With stiff adhesives it becomes
 classical laminate theory. Layers may also be laid loosely (`Bond.NONE`) and slide on each other
 without friction. Bonded layers are solved individually (`model.spectral.modes`), loose layers and
 single layers as the homogeneous plate, which also gives wavelengths, meshes and estimates.

@@ -26,7 +26,7 @@ from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
 from model.finger import Grid
-from model.rig import sections
+from model.rig import plate_sections, sections
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
@@ -453,10 +453,10 @@ RIGS["weather"]["plate"] |= {
 WEATHER = ("temperature", "measured_temperature", "humidity", "measured_humidity")
 SECTIONS: dict[type[Section], tuple[str, tuple[Any, ...]]] = {
     sections.RigSection: ("plain", ()),
-    sections.PlateSection: ("plain", ("plate",)),
-    sections.MaterialSection: ("plain", ("plate", "material")),
-    sections.AirGapSection: ("plain", ("plate", "air_gap")),
-    sections.LayerSection: ("layers", ("plate", "layers", 1)),
+    plate_sections.PlateSection: ("plain", ("plate",)),
+    plate_sections.MaterialSection: ("plain", ("plate", "material")),
+    plate_sections.AirGapSection: ("plain", ("plate", "air_gap")),
+    plate_sections.LayerSection: ("layers", ("plate", "layers", 1)),
     EraSection: ("plain", ("eras", "W")),
     ExciterSection: ("exciters", ("eras", "X1")),
     sections.MassSection: ("plain", ("masses", "camera")),
@@ -469,13 +469,13 @@ SECTIONS: dict[type[Section], tuple[str, tuple[Any, ...]]] = {
 """An instance of every section of a rig file: the rig, and where it is there."""
 
 ELSEWHERE: dict[tuple[type[Section], str], tuple[str, tuple[Any, ...]]] = {
-    (sections.PlateSection, "bond"): ("sheets", ("plate",)),
-    (sections.PlateSection, "layers"): ("layers", ("plate",)),
-    (sections.PlateSection, "grain"): ("board", ("plate",)),
-    **{(sections.PlateSection, key): ("weather", ("plate",)) for key in WEATHER},
+    (plate_sections.PlateSection, "bond"): ("sheets", ("plate",)),
+    (plate_sections.PlateSection, "layers"): ("layers", ("plate",)),
+    (plate_sections.PlateSection, "grain"): ("board", ("plate",)),
+    **{(plate_sections.PlateSection, key): ("weather", ("plate",)) for key in WEATHER},
     **{
-        (sections.MaterialSection, key): ("board", ("plate", "material"))
-        for key in sections.ORTHOTROPIC
+        (plate_sections.MaterialSection, key): ("board", ("plate", "material"))
+        for key in plate_sections.ORTHOTROPIC
     },
     (sections.MassSection, "mass_per_length"): ("board", ("masses", "frame")),
     (sections.MassSection, "points"): ("board", ("masses", "frame")),
@@ -577,7 +577,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         for key in each.model_fields
         # A kind has other keys, `along` has one value, surfaces are in tests/model/structure.
         if key not in ("kind", "along", "surface", "mode_amplitude")
-        and each is not sections.SurfaceSection
+        and each is not plate_sections.SurfaceSection
     ],
 )
 def test_a_rig_that_differs_in_a_key_is_refused(

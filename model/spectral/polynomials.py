@@ -299,6 +299,13 @@ class ClassFunctions:
         """Number of all unknowns."""
         return self.deflections + self.along_x + self.along_y
 
+    @property
+    def slices(self) -> tuple[slice, slice, slice]:
+        """Unknowns of the deflection, of u_x and of u_y."""
+        u_start = self.deflections
+        v_start = u_start + self.along_x
+        return slice(0, u_start), slice(u_start, v_start), slice(v_start, self.size)
+
 
 def class_stiffness(
     functions: ClassFunctions, section: CrossSection, by_side: int | None = None
@@ -321,17 +328,14 @@ def class_stiffness(
     slip = np.real(section.slip)
     lever = np.real(section.lever)[:, None]
     shear = np.real(section.shear)[:, None, None]
-    w = slice(0, functions.deflections)
-    u = slice(w.stop, w.stop + functions.along_x)
-    v = slice(u.stop, functions.size)
+    w, u, v = functions.slices
 
     def part(
         matrix: FloatArray, along_x: FloatArray, along_y: FloatArray, *powers: int
     ) -> FloatArray:
         """One part of the energy; powers of s of both sides in it."""
         factor = 1 if by_side is None else -powers[by_side]
-        products = _product(along_x, along_y)
-        return _product(factor * matrix, products)
+        return _product(factor * matrix, _product(along_x, along_y))
 
     K = np.zeros((functions.size, functions.size))
     w_slopes_x = x.slope_squares[x_parity][:w_x, :w_x]

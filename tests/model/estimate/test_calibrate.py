@@ -233,6 +233,7 @@ def test_calibrate_keeps_what_is_not_identified(coarse):
     held = [one for one in found.parameters if not one.is_identified]
     assert {one.kind for one in held} >= {"bolt_mass", "damping"}
     assert all(one.value == one.before for one in held)
+    assert found.rig.uncertainty.damping == coarse.uncertainty.damping
     for one, true in zip(found.parameters, true_values(truth), strict=True):
         assert abs(one.value - true) < 5 * (one.standard_error or np.inf)
 

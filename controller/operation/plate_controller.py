@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 from controller.play.intent import IntentSource
 from controller.play.loop import Cycle
 from controller.play.planner import Planner
-from controller.play.shared_capabilities import limits_of, playback_capabilities
+from controller.play.shared_capabilities import playback_capabilities
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.group import Group
@@ -188,10 +188,21 @@ class Controller:
         return amplifier
 
     async def arm(self) -> None:
-        """Switch the high voltage on, so that touches are felt; `cycle` must run or start now."""
+        """Switch the high voltage on, so that touches are felt; `cycle` must run or start now.
+
+        Raises InputError if an amplifier cannot play the rig any more, as after a change of its
+        firmware.
+        """
         was_armed = self.group.is_armed
         await self.group.arm()
-        self.cycle.note_armed(limits_of(self._rig, self.amplifiers), was_armed=was_armed)
+        try:
+            capabilities = playback_capabilities(
+                self._rig, self.amplifiers, drive_mode=self.drive_mode
+            )
+        except InputError:
+            await self.group.disarm()
+            raise
+        self.cycle.note_armed(capabilities, was_armed=was_armed)
 
     async def disarm(self) -> None:
         """Ramp to silence, then switch the high voltage off."""

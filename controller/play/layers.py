@@ -217,6 +217,12 @@ class LayerAllocation:
         self._layer_of: Mapping[ContentKey, int] = {}
         """Layers by finger and voice, also while the playback is unknown."""
 
+    def limit_to(self, count: int) -> None:
+        """Use this number of layers from now on; fingers of other layers get a new one."""
+        self.count = count
+        layers = self._layer_of.items()
+        self._layer_of = {key: layer for key, layer in layers if layer < count}
+
     def allocate(self, contents: Sequence[Content]) -> dict[int, Content]:
         """Return contents by layer: a content's present layer, its finger's, a free or ending one.
 

@@ -15,6 +15,7 @@ from typing import ParamSpec, cast
 from controller.play.layer_sets import Sets
 from controller.play.planner import Plan, PlanKind, Planner
 from controller.play.reports import Observers, play_report
+from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.play.slots import RELEASE_RAMP
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Change, RejectCounter, TouchFrame
@@ -29,7 +30,6 @@ from drivers.errors import (
 )
 from drivers.host.group import Group
 from drivers.protocol.definition import HEARTBEAT
-from model.answer.answer import Limits
 from model.quantities import counted
 from model.structure.plate import Plate
 from registry import threads
@@ -232,19 +232,19 @@ class Cycle:
         self._heartbeat_due = threads.now()
         self._wake.set()
 
-    def note_armed(self, limits: Limits, *, was_armed: bool) -> None:
+    def note_armed(self, capabilities: PlaybackCapabilities, *, was_armed: bool) -> None:
         """Note that the amplifiers have been armed.
 
-        The next cycle sends all contents and feeds the watchdogs. limits: present limits of the
-        amplifiers; was_armed: whether they were armed before, so that contents continue. Raises
-        CommandError without a planner.
+        The next cycle sends all contents and feeds the watchdogs. capabilities: of the
+        amplifiers, as identified again; was_armed: whether they were armed before, so that contents
+        continue. Raises CommandError without a planner.
         """
         if self.planner is None:
             raise CommandError("controller must be open; call open() first")
         self._is_newly_armed = True
         if not was_armed:
             self.planner.confirm_silence()
-        self.planner.replace_limits(limits)
+        self.planner.replace_capabilities(capabilities)
         self._schedule_expiry()  # fingers may have rested since before
         self.feed_at_once()
 

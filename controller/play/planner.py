@@ -27,7 +27,6 @@ from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
 from drivers.protocol.definition import HEARTBEAT
-from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.answer.envelope import FADE_RAMP
 from model.answer.plan import prepare_answers, query
@@ -428,11 +427,12 @@ class Planner:
             layer, placement, onset=support.onset_knots > 0, ending=support.ending_knots > 0
         )
 
-    def replace_limits(self, limits: Limits) -> None:
-        """Use other limits, because an amplifier was identified again."""
-        if limits != self.capabilities.limits:
-            self.capabilities = replace(self.capabilities, limits=limits)
-            self._use(self._selector.chooser)
+    def replace_capabilities(self, capabilities: PlaybackCapabilities) -> None:
+        """Use other capabilities, because an amplifier was identified again."""
+        if capabilities != self.capabilities:
+            self.capabilities = capabilities
+            self.slots.replace_capabilities(capabilities)
+            self._use(self._chooser_of(self._selector.chooser.table))
 
     def _count_clocks(self, errors: Mapping[str, float]) -> None:
         """Update the table to clock errors, rms [s]; contents continue until all fingers rest.

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from controller.play.intent import FADED_AFTER
 from controller.play.layer_sets import SetBuilder, Sets
@@ -68,9 +69,15 @@ class Slots:
         """The slots by layer, and the layers that may play."""
         self.is_silence_planned = False
         """Whether silence of all layers was the last plan to be adopted."""
-        self._builder = SetBuilder(rig, capabilities, timing, expiry_of)
+        self._make_builder = partial(SetBuilder, rig, timing=timing, expiry_of=expiry_of)
+        self._builder = self._make_builder(capabilities)
         self._fades_until = -math.inf  # s; for contents that were ended or replaced
         self._ended_contents: Sequence[Content] = ()  # by themselves
+
+    def replace_capabilities(self, capabilities: PlaybackCapabilities) -> None:
+        """Use other capabilities of the amplifiers from the next plan on."""
+        self.layers.limit_to(capabilities.layers)
+        self._builder = self._make_builder(capabilities)
 
     @property
     def by_layer(self) -> Mapping[int, Slot]:

@@ -25,6 +25,7 @@ from controller.play.intent import HapticIntent, Target
 from controller.play.joint_answers import answered, with_paths
 from controller.play.layers import CROSSFADE
 from controller.play.reports import PlayReport
+from controller.play.shared_capabilities import RAMPS_ONLY
 from controller.sources.touch import AT_REST, Contact, ContactKey
 from drivers.host.group import Group
 from kit.chain import Chain, Position
@@ -43,6 +44,7 @@ from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
+from registry import threads
 from sim.far_ends.wire_assignment import SimulatedWire
 
 BUS = SimulatedWire("serial", speed=921_600, shared=True, line_kind="prompt")
@@ -185,6 +187,28 @@ async def test_fingers_that_rest_are_served_within_limits_of_now() -> None:
         await chain.operate("arm")
         await chain.hold(0.3)
         assert served(chain) == 2
+
+
+@in_virtual_time
+async def test_fingers_are_served_with_capabilities_that_became_smaller() -> None:
+    """Firmware with fewer layers, short ramps and no envelopes is armed: no set is refused."""
+    async with two_fingers() as (chain, _):
+        await chain.hold(0.5)
+        assert served(chain) == 2
+        await chain.operate("disarm")
+        chain.at = {}
+        await chain.hold(0.3)
+        chain.far_end.amplifier.capabilities.update(layers=4, ramp_max=200, knots=0)
+        chain.far_end.amplifier.restart(threads.now())
+        await chain.operate("arm")
+        planner = chain.controller.cycle.planner
+        assert planner is not None
+        assert planner.capabilities.envelope_support == RAMPS_ONLY
+        assert (planner.slots.layers.count, planner.capabilities.ramp_max) == (4, 0.2)
+        chain.at = {1: LEFT, 2: RIGHT}
+        await chain.hold(0.3)
+        assert served(chain) == 2
+        assert not chain.refused
 
 
 @in_virtual_time

@@ -78,20 +78,20 @@ class Amplifier(AmplifierRecord):
             # This is not a rejection: the group stops all amplifiers.
             raise FrameError(str(contradicted(self.name, problem)))
         staged = request.staged
-        is_staged = reply["staged"] and not now and self._admission.admitted is staged
+        is_staged = reply["staged"] and not now and self.admission.admitted is staged
         if staged is None or not (reply["played"] or is_staged):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if reply["exact"] else replace(staged, is_exact=False)
 
     def _make_set(self, request: SetRequest) -> list[Values]:
         """Admit a set, and return the values of its parts; raises CommandRefused or Overtaken."""
-        return self._admission.admit(
+        return self.admission.admit(
             request, self.ledger, self._time(), session=self.session, set_time=self._sets_time()
         )
 
     def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
         """Return why the ledger would not admit layers now; None if it would."""
-        return self._admission.refusal_of(
+        return self.admission.refusal_of(
             layers, self.ledger, self._time(), set_time=self._sets_time()
         )
 

@@ -106,13 +106,13 @@ class AmplifierRecord:
     # Sets
     played_at: float = -math.inf
     """Earliest start [s] of the last set sent, or the time when silence was sent."""
-    _starts_at: float = -math.inf
-    """Start [s] of the staged set by the next commit; a time in the past: immediately."""
+    _starts_at: float | None = None
+    """Start [s] of the staged set by the next commit; None or a time in the past: immediately."""
     committed: int = 0
     """Token of the set that it committed last; 0 if it committed none since it was armed."""
     _ledger: Ledger | None = None
     """None until it is identified."""
-    _admission: SetAdmission
+    admission: SetAdmission
     """Which set may be sent to it."""
 
     # Stops
@@ -150,7 +150,7 @@ class AmplifierRecord:
         self.clock = HeldClock()
         self.counts = LinkStatistics()
         self.exchange_time = cache(self._exchange_time)
-        self._admission = SetAdmission(name, self.identification)
+        self.admission = SetAdmission(name, self.identification)
         self.playback_bound = PlaybackBound()
         self._time = line.time
         line.members[address] = self
@@ -203,7 +203,7 @@ class AmplifierRecord:
 
     def expect_commit(self, starts_at: float | None) -> None:
         """Expect a commit that starts the staged set at a time [s]; None: immediately."""
-        self._starts_at = -math.inf if starts_at is None else starts_at
+        self._starts_at = starts_at
 
     def expect_arm(self, until: float) -> None:
         """Expect an Arm until a time [s], unless a stop or disarm comes first."""
@@ -225,7 +225,7 @@ class AmplifierRecord:
         if message.plays and not is_repeated:
             # A set that only silences, or changes nothing, is never too late.
             may_be_late = priority is not Priority.SET
-            self._admission.check(values["token"], now, may_be_late=may_be_late)
+            self.admission.check(values["token"], now, may_be_late=may_be_late)
         if message.arms:
             self._check_may_arm(now)
         self.identification.check_other_host(now)
@@ -271,7 +271,7 @@ class AmplifierRecord:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
         message = REQUESTS[name]
-        self._admission.expire_check()
+        self.admission.expire_check()
         if message.shows_clock:
             # Earlier requests may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
@@ -281,11 +281,11 @@ class AmplifierRecord:
             self.feeding.note_ramp(_RAMP.from_wire(values["ramp"]))
             self.disarms_sent += 1
         if message.arms:
-            self._admission.withdraw()
+            self.admission.withdraw()
             self.may_be_armed = True
             self.playback_bound.note_armed()
         elif message.ends_playback:
-            self._admission.withdraw()
+            self.admission.withdraw()
             if not message.disarms and self._ledger is not None:
                 self.played_at = now
                 self._ledger.may_be_silent.update(range(self._ledger.capabilities["layers"]))
@@ -303,7 +303,7 @@ class AmplifierRecord:
 
     def _note_set_sent(self, message: Message, values: Values, now: float, arrives: float) -> None:
         """Note a part of a set or its commit, with which the admitted set may begin to play."""
-        admitted = self._admission.admitted
+        admitted = self.admission.admitted
         if admitted is None or values["token"] != admitted.token:
             return
         if message is _COMMIT:
@@ -315,15 +315,14 @@ class AmplifierRecord:
         """Note the commit of a set, which starts at `_starts_at`, or when the commit arrives."""
         error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
         self.contradictions.note_commit(now, error)
-        if self._starts_at <= now:
+        starts_at = self._starts_at
+        if starts_at is None or starts_at <= now:
             self.played_at = arrives
             self.ledger.sent(admitted.token, admitted.layers, now)
             return
-        self.played_at = self._starts_at
+        self.played_at = starts_at
         start_error = min(max(error, HIGH_TIME), MAX_START_ERROR)
-        self.ledger.sent(
-            admitted.token, admitted.layers, now, starts=self._starts_at, error=start_error
-        )
+        self.ledger.sent(admitted.token, admitted.layers, now, starts=starts_at, error=start_error)
 
     def _note_immediate_start(self, admitted: StagedSet, now: float, arrives: float) -> None:
         """Note a set that starts when it arrives."""
@@ -337,7 +336,7 @@ class AmplifierRecord:
         Raises CommandRefused if two consecutive statuses contradict the requests sent.
         """
         now = self._time()
-        self._admission.expire_check()
+        self.admission.expire_check()
         self.counts.last_round_trip = now - sent_at
         message = REQUESTS[name]
         if message.feeds:
@@ -351,9 +350,7 @@ class AmplifierRecord:
         self, message: Message, values: Values, status: Values, sent_at: float, now: float
     ) -> None:
         """Note a status that replies to a request sent at a time [s], see `note_reply`."""
-        latch = status["latch"]
-        if latch != self.latch and (self.latch is None or is_newer_token(latch, self.latch)):
-            self.latch = latch
+        self._note_latch(status["latch"])
         self.status = status
         self.status_at = now
         is_enabled = status["state"] == ENABLED
@@ -368,11 +365,7 @@ class AmplifierRecord:
             ledger.note_ended(_RAMP.from_wire(values["ramp"]), sent_at, now)
             self.committed = status["token"]
             return
-        # A set plays some time after its commit. An earlier status may show that it plays, but not
-        # that it does not.
-        is_sure = status["token"] != self.committed or sent_at >= self.played_at + COMMITTING
-        if ledger is not None and is_sure:
-            self._confirm(status["token"], now)
+        self._note_token(status["token"], sent_at, now)
         if message is _PING and not is_enabled:
             raise disarmed(self.name, status)
         if ledger is not None and self.session and is_enabled and not message.changes_state:
@@ -386,12 +379,27 @@ class AmplifierRecord:
                 clock=self.clock,
             )
 
+    def _note_latch(self, latch: int) -> None:
+        """Note the latch of a status, unless a newer one was shown before."""
+        if latch != self.latch and (self.latch is None or is_newer_token(latch, self.latch)):
+            self.latch = latch
+
+    def _note_token(self, token: int, sent_at: float, now: float) -> None:
+        """Note the token of a status that was requested at a time [s].
+
+        A set plays some time after its commit. An earlier status may show that it plays, but not
+        that it does not.
+        """
+        is_sure = token != self.committed or sent_at >= self.played_at + COMMITTING
+        if self._ledger is not None and is_sure:
+            self._confirm(token, now)
+
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier has reported the set with this token as the one it plays."""
         self.committed = token
         if self._ledger is not None:
             self._ledger.resolve(token, now)
-        self._admission.note_committed(token)
+        self.admission.note_committed(token)
 
     def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
         """Note a message that came without a request; an event is passed to the listeners."""

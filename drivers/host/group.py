@@ -244,9 +244,14 @@ class Group:
             self._limit.reschedule(threads.now())
 
     async def _exchange(self, exchange: Callable[[], Awaitable[_T]]) -> _T:
-        """Run an exchange of the control loop; react to an error, then raise it."""
+        """Run an exchange of the control loop; react to an error, then raise it.
+
+        The control loop makes only one exchange at a time; stops and disarms can come meanwhile.
+        """
         if not self.is_armed:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
+        if self._limit is not None:
+            raise RuntimeError("an exchange must end before the next one begins")
         epoch = self.members.epoch
         limit = asyncio.timeout(None)
         try:
@@ -285,7 +290,7 @@ class Group:
     async def _react(self, failure: Failure, error: Exception) -> Exception:
         """React to a failure as `REACTIONS` demands; return the error to be raised."""
         reaction = REACTIONS[failure]
-        if reaction.state is GroupState.LOST:
+        if reaction.is_loss:
             self._lose(error)
         if reaction.stops:
             amplifiers = self.amplifiers

@@ -67,8 +67,8 @@ class Reaction(NamedTuple):
 
     stops: bool
     """Whether all amplifiers are stopped."""
-    state: GroupState | None = None
-    """Next state of the group; None: unchanged."""
+    is_loss: bool = False
+    """Whether the group enters the state LOST; otherwise only a stop changes its state."""
     error: type[DriverError] | None = None
     """Class of the error that the control loop receives; None: the original error."""
     message: str | None = None
@@ -90,7 +90,7 @@ REACTIONS: Mapping[Failure, Reaction] = {
     ),
     # Nothing new starts. The other amplifiers are fed, and play their last set.
     Failure.DEGRADED: Reaction(stops=False, error=LinkDegraded),
-    Failure.LOST: Reaction(stops=True, state=GroupState.LOST),
-    Failure.FAULT: Reaction(stops=True, state=GroupState.STOPPED),
+    Failure.LOST: Reaction(stops=True, is_loss=True),
+    Failure.FAULT: Reaction(stops=True),
 }
 """What follows each failure. The daemon then enters COMM_LOST after LOST, and FAULT after FAULT."""

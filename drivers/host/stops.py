@@ -106,6 +106,7 @@ class PendingStop:
     _latch: int | None = None
     """The newest latch that was known when the last request was queued."""
     _limit: asyncio.Timeout | None = None
+    """Ends `repeat`; None before that, when only `ends_at` is set."""
 
     def queue(self) -> None:
         """Queue the first request now."""

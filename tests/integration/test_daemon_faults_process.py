@@ -313,21 +313,24 @@ async def test_daemon_plays_on_beside_a_second_one_and_without_descriptors(tmp_p
     """
     async with playing_daemon(tmp_path) as (daemon, era, journal):
         pid = daemon.process.pid
-        status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
-        assert status == 2
-        assert f"process {pid}" in err
-        text = (tmp_path / "daemon.yaml").read_text("utf-8")
-        (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
-        other = await asyncio.create_subprocess_exec(
-            *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
-        )
-        await until((tmp_path / "b.sock").is_socket)
-        async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
-            await until_state(waiting, "COMM_LOST")
-        other.terminate()
-        _, log = await other.communicate()
-        assert b"Traceback" not in log
-        assert (await era.status()).state == "OPERATION_ENABLED"
+        await disarmed(era)
+        async with era.armed("test", lease_s=60):  # renews its lease while daemons start
+            status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
+            assert status == 2
+            assert f"process {pid}" in err
+            text = (tmp_path / "daemon.yaml").read_text("utf-8")
+            (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
+            other = await asyncio.create_subprocess_exec(
+                *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
+            )
+            await until((tmp_path / "b.sock").is_socket)
+            async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
+                await until_state(waiting, "COMM_LOST")
+            other.terminate()
+            _, log = await other.communicate()
+            assert b"Traceback" not in log
+            assert (await era.status()).state == "OPERATION_ENABLED"
+        await play(era, daemon.far)
         await until(lambda: any(daemon.far.summary().levels))
         before = limited(pid, resource.RLIMIT_NOFILE, max(numbers_in(f"/proc/{pid}/fd")) + 1)
         waiting = []

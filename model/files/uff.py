@@ -51,13 +51,14 @@ _FIELDS = {
     "orddenom_spec_data_type": (10, 0, 10, int),
     "orddenom_axis_units_lab": (10, 47, 67, str),
 }
+_IEEE_754 = b"2"  # floating-point format of a binary dataset 58
 _SI = 1  # units code of dataset 164
 _NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimeters, centimeters, inches
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
 _BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
 _HEADER = re.compile(
     rb"[ \t]*(?P<kind>\d{1,9})(?!\d)"
-    rb"(?:[bB]\s*(?P<order>\d)(?:\s*\d+){2}[ \t]+(?P<bytes>\d{1,18})(?!\d))?[^\r\n]*"
+    rb"(?:[bB]\s*(?P<order>\d)\s*(?P<floats>\d+)\s*\d+[ \t]+(?P<bytes>\d{1,18})(?!\d))?[^\r\n]*"
 )
 # As Fortran writes them: they may touch, with D for E, or without a letter.
 _NUMBER = re.compile(
@@ -144,14 +145,23 @@ def write_universal(path: Path, content: Universal) -> None:
 def read_universal(path: Path) -> Universal:
     """Read a file; raises InputError with file and line if it is damaged or of another format."""
     nodes: dict[int, tuple[float, ...]] = {}
-    functions, length = [], 1.0
+    turned: set[int] = set()
+    functions: list[Function] = []
+    length = 1.0
     for block in blocks(path, read_measured_bytes(path)):
         if block.kind == 58:
             functions.append(_function(path, block))
         elif block.kind == 164:
             length, _ = units_of(path, block)
         elif block.kind in (15, 2411):
-            read_nodes(path, block, nodes, set())
+            read_nodes(path, block, nodes, turned)
+    for function in functions:
+        local = turned.intersection((function.response, function.reference))
+        if local:
+            raise InputError(
+                f"{function.place}: responses must be in the global system, got a local one of "
+                f"node {min(local)}; export them in global coordinates"
+            )
     return Universal(
         {n: (x / length, y / length, z / length) for n, (x, y, z) in nodes.items()}, functions
     )
@@ -237,6 +247,11 @@ def blocks(path: Path, content: bytes) -> Iterator[DatasetBlock]:
         if head is None:
             raise InputError(
                 f"{path}:{line}: dataset must begin with its number, got none; export it again"
+            )
+        if head["floats"] not in (None, _IEEE_754):
+            raise InputError(
+                f"{path}:{line}: floating-point format must be 2 (IEEE 754), got "
+                f"{int(head['floats'])}; export it as IEEE 754 or as ASCII"
             )
         data = begin
         if head["order"]:  # its numbers are any bytes

@@ -155,7 +155,7 @@ def test_read_measured_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: P
 def test_read_measured_reads_binary_uff(
     responses: Measurement, coarse_rig: Rig, path: Path, tmp_path: Path
 ) -> None:
-    """Records as bytes (58b) are read to the last bit; one that lost some of them is refused."""
+    """Binary records (58b) are read to the last bit; damage and other formats are refused."""
     sets = pyuff.UFF(str(path)).read_sets()
     for each in sets[2:]:
         each.update(binary=1, n_bytes=0)
@@ -170,6 +170,7 @@ def test_read_measured_reads_binary_uff(
         content[: cut - 24] + b"\n" + content[cut:],
         content.replace(size, b"%d" % (int(size) + 8), 1),  # would run into the next record
         content[:cut] + b"7\r\n" + content[cut:],
+        re.sub(rb"(58b +\d +)2", rb"\g<1>1", content, count=1),  # floating point of DEC VMS
     ):
         binary.write_bytes(wrong)
         with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
@@ -199,6 +200,7 @@ DAMAGED = {
         ("  5.00000e+01", "  x.00000e+01", r":\d+: .*'x.00000e"),
         ("         1   3 ", "         1   1 ", r":\d+: .*1 and 3"),
         ("    4         0", "    9         0", ""),
+        ("         1         0         0", "         1         0         7", r":\d+: .* node 1"),
         ("\n    -1\n", "\n    -3\n", r":\d+: "),
         ("NONE", "\n    -1\n    -1\n    58\nNONE", r":\d+: "),  # a record without its header
     ],

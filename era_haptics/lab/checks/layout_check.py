@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ MAX_REGION_TOUCHES = 30
 MAX_POSITIONS = 120
 """Largest number of positions in all regions."""
 
+_NOWHERE = "is felt nowhere"
+_COVERED = "is covered by later regions, or is off the plate"
 _ALIKE = 1.25  # ratio of frequencies that feel nearly alike
 _MIN_STEP = 0.008  # m; closer touches hardly differ
 _RESTING_AWAY = 0.06  # m, minimum distance from a touch to the resting finger
@@ -156,13 +159,15 @@ def _check(
     target = strongest_target(layout, name, region, at=start)
     region_name = ELSEWHERE if region is None else region.name
     if target is None or not positions:
-        problem = "is felt nowhere" if target is None else "is covered by later regions"
+        problem = _NOWHERE if target is None else _COVERED
         level = layout.level_of(name, region)
         return CheckedEffect(region_name, name, on, level, (), (f"{name} {problem}",))
     touches = []
     for number, at in enumerate(positions):
         touches.append(simulator.touch(target, at, None))
-        touches.append(simulator.touch(target, at, _resting(table.plate, at, number)))
+        resting = _resting(table.plate, at, number)
+        if resting is not None:
+            touches.append(simulator.touch(target, at, resting))
     is_raised = target.pulse is not None and target.pulse.is_raised
     has_margin = target.band is None and not is_raised
     is_for_motion = layout.effects[name].is_for_motion
@@ -180,7 +185,7 @@ def touch_positions(
 ) -> tuple[list[Point], float]:
     """Return up to `count` positions [m], evenly spaced over a region, and the area of each [m²].
 
-    Excludes parts that later regions cover.
+    Excludes parts that later regions cover, and parts outside the outline of the plate.
     """
     corners = [(0.0, 0.0), (plate.length, plate.width)]
     if region is not None:
@@ -189,7 +194,9 @@ def touch_positions(
     step = _MIN_STEP
     while True:
         grid, area = _grid(low, high, step)
-        positions = [at for at in grid if layout.region_at(*at) is region]
+        is_on_plate = plate.covers(np.array(grid)).tolist()
+        on_plate = list(compress(grid, is_on_plate))
+        positions = [at for at in on_plate if layout.region_at(*at) is region]
         if len(positions) <= count:
             return positions, area
         step *= 1.1
@@ -210,15 +217,19 @@ def _grid(low: FloatArray, high: FloatArray, step: float) -> tuple[list[Point], 
     return centers, length * width
 
 
-def _resting(plate: Plate, at: Point, number: int) -> Point:
-    """Return the position of the second finger: in another quarter of the plate each time."""
+def _resting(plate: Plate, at: Point, number: int) -> Point | None:
+    """Return the position of the second finger: in another quarter of the plate each time.
+
+    None if the centers of all quarters are outside the outline of the plate.
+    """
     quarters = []
     for x in (0.25 * plate.length, 0.75 * plate.length):
         for y in (0.25 * plate.width, 0.75 * plate.width):
-            quarters.append((x, y))
+            if plate.contains(x, y):
+                quarters.append((x, y))
     distant = [quarter for quarter in quarters if math.dist(quarter, at) >= _RESTING_AWAY]
     if not distant:
-        return max(quarters, key=lambda quarter: math.dist(quarter, at))
+        return max(quarters, key=lambda quarter: math.dist(quarter, at), default=None)
     return distant[number % len(distant)]
 
 

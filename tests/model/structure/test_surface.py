@@ -14,9 +14,13 @@ from benchmarks.promise.contents import share_kept
 from benchmarks.setting import random_contacts
 from benchmarks.surface import exported_modes
 from cases import read_yaml
+from controller.effects.kinds import Click
+from controller.effects.layout import SurfaceLayout
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Touch, TouchFrame
 from era_haptics.command import run_era
+from era_haptics.lab.checks import layout_check
+from era_haptics.lab.checks.layout_check import check_layout
 from era_haptics.lab.design.problem import area_of
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_on_plate
@@ -301,14 +305,17 @@ def test_modes_below_zero_are_refused(modes: Mapping[str, FloatArray], tmp_path:
         load_rig(_write(tmp_path, modes, frequencies=frequencies))
 
 
-def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path) -> None:
+def test_cut_out_has_no_fingers(
+    modes: Mapping[str, FloatArray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Faces around a hole give two rings; a finger in the hole is refused, no cell is there.
 
     A panel that reports one there has it rejected, so that all others are served. Along the wrong
-    normal the surface would be a line.
+    normal the surface would be a line. A check of a layout touches the plate only, although the
+    hole is also at the center of a quarter, where a second finger would rest.
     """
     first = (21 * np.arange(15)[:, None] + np.arange(20)).ravel()
-    faces = np.setdiff1d(first, 21 * np.arange(5, 9)[:, None] + np.arange(7, 13))[:, None]
+    faces = np.setdiff1d(first, 21 * np.arange(2, 9)[:, None] + np.arange(3, 13))[:, None]
     rig = load_rig(_write(tmp_path, modes, faces=np.add(faces, [0, 1, 22, 21])))
     assert len(getattr(rig.plate.surface, "outline", ())) == 2
     with pytest.raises(InputError, match=r"finger must be within the outline"):
@@ -323,6 +330,11 @@ def test_cut_out_has_no_fingers(modes: Mapping[str, FloatArray], tmp_path: Path)
     assert len(table.cell_centres) < table.grid.cell_count
     candidates = area_of("anywhere", rig.plate).candidates(0.02)  # for ERAs
     assert rig.plate.covers(np.vstack([table.cell_centres, candidates])).all()
+    monkeypatch.setattr(layout_check, "MAX_REGION_TOUCHES", 6)
+    (checked,) = check_layout(SurfaceLayout((), {"click": Click()}, elsewhere="click"), table)
+    fingers = [touch.at for touch in checked.touches]
+    fingers += [touch.resting for touch in checked.touches if touch.resting is not None]
+    assert rig.plate.covers(np.array(fingers)).all()
 
 
 def test_even_odd_rule_counts_holes_and_edges() -> None:

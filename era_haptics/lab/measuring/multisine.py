@@ -19,6 +19,9 @@ from model.errors import InputError
 PERIOD = 1.0
 """s; lines are whole numbers of hertz."""
 
+MIN_PERIODS = 2
+"""Minimum number of periods in a recording: between their lines, its spectrum is only noise."""
+
 _DRAWS = 20  # random phases; the lowest crest factor among them is 3.1 to 3.6
 _RAMP = 0.02  # s
 _STEP = 10  # Hz
@@ -132,7 +135,8 @@ def multisine_frequencies(low: float, high: float) -> FloatArray:
 class ResponseEstimate:
     """Sample-to-sample responses (f, inputs, sources), H1 estimate over all runs.
 
-    - std (f, inputs): standard deviation of each response's modulus.
+    - std (f, inputs): standard deviation of each complex response; that of its real part, and of
+      its modulus, is smaller by the square root of 2.
     - coherence (f, inputs): fraction of the power that comes from the sources.
     - even (inputs,): amplitude at even lines, which are not played, relative to the played lines,
       minus noise.
@@ -147,18 +151,26 @@ class ResponseEstimate:
 def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEstimate:
     """Estimate responses from whole periods of each run, (periods x samples, inputs).
 
-    Requires at least two periods: their spectrum contains only noise between the lines of a single
-    period. Solves Y = U H^T at each line by least squares, with U the amplitudes played (runs,
-    sources).
+    Solves Y = U H^T at each line by least squares, with U the amplitudes played (runs, sources).
+    Raises InputError for fewer than `MIN_PERIODS` periods, or fewer runs than sources.
     """
     length = len(recorded[0])
     periods = length // multisine.samples
+    if periods < MIN_PERIODS:
+        raise InputError(f"a recording must have at least {MIN_PERIODS} periods, got {periods}")
+    if len(recorded) < multisine.sources:
+        raise InputError(
+            f"runs must be at least as many as sources, {multisine.sources}, got {len(recorded)}"
+        )
     spectra = np.array([np.fft.rfft(run, axis=0) for run in recorded], dtype=complex)
     spectra *= 2 / length
     lines = multisine.lines * periods
     received = spectra[:, lines]  # (runs, f, inputs)
     played = np.array([multisine.played(run) for run in range(len(recorded))])  # (runs, f, s)
-    values = np.linalg.solve(played.transpose(1, 0, 2), received.transpose(1, 0, 2))
+    U = played.transpose(1, 0, 2)
+    Y = received.transpose(1, 0, 2)
+    adjoint = U.conj().swapaxes(1, 2)
+    values = np.linalg.solve(adjoint @ U, adjoint @ Y)
     # The noise is in the bins around each line that no period has.
     offsets = np.arange(-_AROUND * periods, _AROUND * periods + 1)
     offsets = offsets[offsets % periods != 0]

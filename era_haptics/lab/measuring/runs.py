@@ -10,6 +10,7 @@ from era_haptics.lab.measuring.desk import MIN_SETTLING
 from era_haptics.lab.measuring.multisine import PERIOD, Multisine
 from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import FloatArray
+from model.errors import InputError
 
 TRIES = 3
 """Attempts of a run."""
@@ -56,9 +57,15 @@ def play_and_record(
     """Play samples (n, outputs), and keep `seconds` of the recording after `settling` [s].
 
     is_whole: checks the kept recording (n, inputs) for lost blocks; if it fails, the run is
-    repeated.
+    repeated. Raises InputError for a signal that ends before.
     """
-    start, count = round(settling * card.rate), round(seconds * card.rate)
+    start = round(settling * card.rate)
+    count = round(seconds * card.rate)
+    if len(played) < start + count:
+        raise InputError(
+            f"a run must last at least {settling + seconds:g} s, {settling:g} s of settling and "
+            f"{seconds:g} s to keep, got {len(played) / card.rate:g} s; play a longer signal"
+        )
     for repeated in range(tries):
         kept = card.run(played)[start : start + count].astype(float)
         if is_whole(kept):

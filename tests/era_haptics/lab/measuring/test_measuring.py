@@ -16,8 +16,14 @@ from era_haptics.command import run_era
 from era_haptics.lab.measuring import simulated_measurement
 from era_haptics.lab.measuring.desk import Desk, WiredSensor
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
-from era_haptics.lab.measuring.multisine import Multisine, ResponseEstimate, multisine_frequencies
+from era_haptics.lab.measuring.multisine import (
+    Multisine,
+    ResponseEstimate,
+    estimate,
+    multisine_frequencies,
+)
 from era_haptics.lab.measuring.recording_checks import check_wiring
+from era_haptics.lab.measuring.runs import play_and_record
 from era_haptics.lab.measuring.sound_card import SoundCard
 from examples.make_measured import Accelerometer, record_responses
 from kit.desk_plate import Converters, DeskModel, DeskPlate, Truth
@@ -98,6 +104,21 @@ def undisturbed(rig: Rig, truth: Truth) -> MeasuredResponses:
     """The plate measured with nothing wrong."""
     desk = Desk(rig, SENSORS)
     return measure(desk, card(truth), sines(desk))
+
+
+def test_estimate_uses_all_rounds_of_runs_and_requires_whole_recordings() -> None:
+    """Two rounds give the gains of a wire; one period, or a signal that ends early, is refused."""
+    sines = Multisine(np.array([61.0, 151.0]), 3, 1000.0, level=0.1)
+    gains = np.array([[1.0, -2.0, 0.5], [0.0, 3.0, -1.0]])
+    signals = [sines.signal(run, periods=4)[1000:3000] for run in range(6)]
+    runs = [signal @ gains.T for signal in signals]
+    np.testing.assert_allclose(estimate(sines, runs).values, [gains, gains], atol=1e-9)
+    with pytest.raises(InputError, match="at least 2 periods, got 1"):
+        estimate(sines, [run[:1000] for run in runs])
+    card = SoundCard(outputs=3, inputs=2, limit=1.0)
+    card.rate = sines.rate
+    with pytest.raises(InputError, match=r"at least 3 s, .* got 2 s"):
+        play_and_record(card, signals[0], settling=1.0, seconds=2.0, is_whole=np.any)
 
 
 def test_multisine_has_its_level_and_orthogonal_runs() -> None:

@@ -426,10 +426,18 @@ def unknowns(identification: Identification) -> list[str]:
         if not is_of_modes:
             name = space.names[best_of(np.abs(combinations[worst]))]
         rows.append(
-            f"{name}: known to {100 * std[worst]:.2g} %, before {100 * before_std[worst]:.2g} %; "
+            f"{name}: known to {_error_text(kind, std[worst])}, "
+            f"before {_error_text(kind, before_std[worst])}; "
             f"{_advice(identification, combinations[worst])}"
         )
     return rows
+
+
+def _error_text(kind: str, std: float) -> str:
+    """Format a standard error of a kind in `relevant`: phases in degrees, others in per cent."""
+    if kind == "phase":
+        return f"{math.degrees(std):.2g}°"
+    return f"{100 * std:.2g} %"
 
 
 def _advice(identification: Identification, combination: FloatArray) -> str:
@@ -496,6 +504,6 @@ def identification_errors(identification: Identification) -> dict[KeyPath, float
         rig, ("thickness", "loss_factor"), ("stiffness", "damping"), rig.foot_names
     )
     errors = []
-    for parameter, error in zip(parameters, relative, strict=False):  # feet without a spring: none
+    for parameter, error in zip(parameters, relative, strict=True):
         errors.append((parameter, parameter.before * error))
     return errors_by_key(rig, errors)

@@ -278,10 +278,10 @@ def _identified(
 
 def fit_rows(identification: Identification) -> list[str]:
     """Return lines on how well the model explains the measurement."""
-    chi2 = identification.chi2
     held_out = identification.held_out
-    verdict = "explains" if chi2 <= MAX_CHI2 else "does not explain"
-    rows = [f"chi² {chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})"]
+    verdict = "explains" if identification.is_explained else "does not explain"
+    chi2 = f"chi² {identification.chi2:.2f} (at most {MAX_CHI2:g})"
+    rows = [f"{chi2}: the model {verdict} the measurement"]
     material = identification.rig.plate.material
     if material.orthotropy != identification.before.plate.material.orthotropy:
         moduli = [f"{key} {modulus / 1e9:.4g}" for key, modulus in material.moduli.items()]

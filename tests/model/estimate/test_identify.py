@@ -306,6 +306,7 @@ def test_bonded_frame_is_not_known_well_by_sensors_at_feet(rig: Rig, sensors: in
     )
     assert frame.chi2 < 2
     assert not frame.is_explained
+    assert "does not explain" in fit_rows(frame)[0]
     assert frame.rig.uncertainty == rig.uncertainty
     assert identification_json(frame, [])["known_well"] is False
     assert uneven.is_explained

@@ -212,13 +212,19 @@ def _parameter_json(parameter: Parameter) -> dict[str, Any]:
 
 
 def _gains_json(era: Actuator, errors: FloatArray) -> dict[str, Any]:
-    """Return the gains of an ERA; errors (f,): standard errors, NaN if not measured."""
+    """Return the gains of an ERA; errors (f,): standard errors, NaN if not measured.
+
+    An ERA that was not measured keeps the gains of its rig, with null standard errors.
+    """
     frequencies, magnitudes, phases = np.reshape(era.gains, (-1, 3)).T
+    standard_errors = errors[np.isfinite(errors)].tolist()
+    if not standard_errors:
+        standard_errors = [None] * len(frequencies)
     return {
         "frequency_hz": frequencies.tolist(),
         "magnitude": magnitudes.tolist(),
         "phase_deg": np.degrees(phases).tolist(),
-        "standard_error": errors[np.isfinite(errors)].tolist(),
+        "standard_error": standard_errors,
     }
 
 

@@ -191,6 +191,7 @@ def test_calibrate_finds_all_that_differs(coarse, truth):
 def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(coarse, truth):
     """An ERA that moves nothing is named; its spring is still found by the others' responses.
 
+    Its gains stay as in the rig, without a standard error.
     So is a sensor that has come off and hears next to nothing. One in twenty of the other values is
     wrong by factors of 2 to 20 with any phase, and left out.
     """
@@ -203,11 +204,16 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(coarse, truth):
     wild[:, 2] = wild[:, :, PLATES_NAMES.index("P4")] = False
     values[wild] *= rng.uniform(2, 20, wild.sum()) * np.exp(2j * np.pi * rng.random(wild.sum()))
     values[:, 2] *= 1e-4
-    found = calibrate(coarse, replace(clean, values=values.swapaxes(1, 2)))
+    kept = ((100.0, 0.9, 0.0), (300.0, 1.1, 0.0))
+    eras = [replace(era, gains=kept) if era.name == "NE" else era for era in coarse.eras]
+    rig = replace(coarse, eras=tuple(eras))
+    found = calibrate(rig, replace(clean, values=values.swapaxes(1, 2)))
     assert 0.9 * wild.sum() <= found.outlier_count <= 1.1 * wild.sum()
     assert found.scales == {}
     assert (found.dead_sensors, found.dead_eras) == (("P4",), ("NE",))
-    assert found.rig.era("NE").gains == ()
+    assert found.rig.era("NE").gains == kept
+    gains = calibration_json(found, rig)["gains"]["NE"]
+    assert (gains["magnitude"], gains["standard_error"]) == ([0.9, 1.1], [None, None])
     assert [one.value for one in found.parameters] == pytest.approx(true_values(truth), rel=0.02)
 
 

@@ -349,7 +349,7 @@ class Calibration:
     @cached_property
     def _fields(self) -> ComplexArray:
         """Responses of the rig without form errors and gains (f, s, eras) [1/s²]."""
-        plain = replace(self.plate, form=None, law=None, last_places={})
+        plain = replace(self.plate, form=None, law=None)
         return plain.with_rig(self._fitted).responses()
 
     @cached_property

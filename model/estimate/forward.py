@@ -32,7 +32,7 @@ therefore its mode shapes (`ReducedModes` of `model.reduction`).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
@@ -345,8 +345,8 @@ class ForwardModel:
     """Plate in coordinates that allow form errors."""
     law: ComplexArray | None = None
     """Change of the receptance (f, s, n) [m/N] if losses are viscous, None to neglect it."""
-    last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
-    """Latest solution for all attachments, by footprint."""
+    last_places: dict[Hashable, AttachmentPoints] = field(default_factory=dict)
+    """Latest solution for all attachments, by all that it depends on; copies share it."""
 
     def __post_init__(self) -> None:
         """Raise InputError for a plate with wrong responses and slopes."""
@@ -459,7 +459,8 @@ class ForwardModel:
         return self._solved(footprints)
 
     def _solved(self, footprints: FloatArray) -> AttachmentPoints:
-        key = footprints.tobytes()
+        inputs = (footprints, self.movable, self.sides)
+        key = (self.modes, *[values.tobytes() for values in inputs])
         if key not in self.last_places:
             self.last_places.clear()
             self.last_places[key] = places_of(self.modes, footprints, self.movable, self.sides)

@@ -172,7 +172,7 @@ def _fit_in_stages(rig: Rig, measurement: Measurement) -> RigFit:
     # Solve the plate for its identified thickness and modulus, as for a table.
     identified = plate_with(rig.plate, result.fitted_plate.values)
     identified = replace(identified, mode_deviations=rig.plate.mode_deviations)
-    solved = replace(result.model, free=_solved_again(free, identified), last_places={})
+    solved = replace(result.model, free=_solved_again(free, identified))
     return fit(solved, measurement, start=result.x)
 
 

@@ -400,7 +400,7 @@ def of_a_laminate(model: ForwardModel) -> ForwardModel:
     free = solve_free_plate(plate, mesh, frequency_max=500.0)
     assert free.modes.losses.any()
     rig = replace(model.rig, plate=plate, laminate=laminate)
-    return replace(model, rig=rig, free=free, last_places={})
+    return replace(model, rig=rig, free=free)
 
 
 def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None:
@@ -475,6 +475,18 @@ def test_derivatives_are_slopes_of_the_responses(model: ForwardModel, kind: str)
         assert {"magnet mass SW", "force factor NE"} <= {*space.names}
         assert space.std[space.index("stiffness of foot foam")] == 0.3
         assert found[..., space.groups["magnet_mass"]].any() == (kind == "free")
+
+
+def test_copied_model_with_another_plate_has_the_shapes_of_that_plate(model: ForwardModel) -> None:
+    """A laminate responds as its own solution does, after the rig's plate at the same positions."""
+    known = np.zeros(model.space.size)
+    _ = model.at(known).responses
+    other = of_a_laminate(model)
+    rig = other.rig
+    pad = np.array([[PAD.x, PAD.y]])
+    solved = other.free.acceleration(rig.eras, FORWARD_FREQUENCIES, pad, loads=rig.masses)
+    expected = solved[..., 0] / [era.full_level for era in rig.eras]
+    np.testing.assert_allclose(other.at(known).responses[:, -1], expected, rtol=1e-5)
 
 
 def test_moved_sensor_weighs_on_the_plate_where_it_measures() -> None:

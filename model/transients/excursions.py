@@ -449,7 +449,8 @@ def reach_of(rig: Rig, free: FreePlate) -> Reach:
     high = min(limits.frequency_max, max(UP_TO, low))
     frequencies = np.arange(low, high + 1e-9, _STEP)
     positions = lattice(_positions_along(plate.length), _positions_along(plate.width))
-    level = np.minimum(magnets_of(rig, free).shares(frequencies), limits.level)[:, None]
+    shares = magnets_of(rig, free).shares(frequencies)
+    levels = np.minimum.outer(shares, _highest_levels(rig))
     threshold = detection_threshold(frequencies, rig.threshold)[:, None]
     ratios = list[FloatArray]()
     for batch in np.array_split(positions, math.ceil(len(positions) / _BATCH)):
@@ -458,17 +459,28 @@ def reach_of(rig: Rig, free: FreePlate) -> Reach:
         )
         fields = free.acceleration(rig.eras, frequencies, points.reshape(-1, 2), loads=rig.masses)
         fields = fields.reshape(len(frequencies), len(rig.eras), *weights.shape)
-        at_centre = fields[..., 0]
-        phases = at_centre.conj() / np.abs(at_centre)
-        in_phase = np.abs((fields * phases[..., None]).sum(axis=1))
-        felt = level * (in_phase * weights).sum(axis=-1)
+        at_center = fields[..., 0]
+        phases = at_center.conj() / np.abs(at_center)
+        in_phase = fields * phases[..., None]
+        driven = np.abs(np.einsum("fn,fnpw->fpw", levels, in_phase))
+        felt = (driven * weights).sum(axis=-1)
         ratios.append(felt / _finger_reductions(rig, free, batch, frequencies) / threshold)
-    levels = decibels(np.concatenate(ratios, axis=1))
+    levels_db_sl = decibels(np.concatenate(ratios, axis=1))
     return Reach(
         frequencies=frequencies,
-        least_db_sl=levels.min(axis=1),
-        shares=(levels >= STRONG_DB_SL).mean(axis=1),
+        least_db_sl=levels_db_sl.min(axis=1),
+        shares=(levels_db_sl >= STRONG_DB_SL).mean(axis=1),
     )
+
+
+def _highest_levels(rig: Rig) -> FloatArray:
+    """Return the levels (n,) that the limits allow each ERA if all play at the same time.
+
+    The ERAs of an amplifier share its power equally.
+    """
+    amplifiers = [rig.wiring[era.name].amplifier for era in rig.eras]
+    counts = np.array([amplifiers.count(amplifier) for amplifier in amplifiers])
+    return np.minimum(rig.limits.level, np.sqrt(rig.limits.power / counts))
 
 
 def _positions_along(side: float) -> FloatArray:

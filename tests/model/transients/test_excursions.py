@@ -22,7 +22,7 @@ from model.reduction.reduced_plate import (
     reduce_plate,
     supported_modes,
 )
-from model.rig.rig import Rig, Uncertainty
+from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
 from model.structure.attachments import (
@@ -42,6 +42,7 @@ from model.transients.excursions import (
     excursions_of,
     magnets_of,
     motions_along,
+    reach_of,
     relative_motions,
 )
 from model.transients.knots import (
@@ -96,6 +97,22 @@ def test_excursion_within_the_frequencies_of_a_rig() -> None:
     assert 60 < half.allowed < full.allowed < 300
     narrow = replace(rig, limits=replace(rig.limits, frequency_min=full.allowed))
     assert not excursions_of(narrow).passed.any()
+
+
+@pytest.mark.parametrize(("amplifiers", "lower_db"), [(1, 6.02), (2, 3.01)])
+def test_reach_falls_with_the_power_of_an_amplifier(amplifiers: int, lower_db: float) -> None:
+    """Four ERAs that share a power of 1 play at half level, and two at 1 / sqrt(2)."""
+    rig = make_paper_rig(12, 9)
+    wiring = {
+        era.name: Channel(f"amplifier{number % amplifiers}", number)
+        for number, era in enumerate(rig.eras)
+    }
+    limits = replace(rig.limits, frequency_max=60.0)
+    rig = replace(rig, wiring=wiring, limits=limits)
+    limited = replace(rig, limits=replace(limits, power=1.0))
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=60.0)
+    lower = reach_of(rig, free).least_db_sl - reach_of(limited, free).least_db_sl
+    assert lower == pytest.approx(np.full(len(lower), lower_db), abs=0.01)
 
 
 def board(rig: Rig, rng: np.random.Generator) -> Rig:

@@ -55,6 +55,7 @@ from model.fem import (
     factorise,
     lowest_modes,
 )
+from model.reduction.point_cache import PointCache
 from model.reduction.surface_modes import RESIDUAL_ORDER, SurfaceModes
 from model.spectral.modes import (
     KnownModes,
@@ -149,7 +150,7 @@ class FiniteElementModes:
         self.losses = np.zeros(kept)
         self.dispersion: Dispersion | None = None
         self.largest_truncated = 1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift)
-        self._cache: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
+        self._cache = PointCache[FloatArray](_MAX_CACHED)
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -179,8 +180,7 @@ class FiniteElementModes:
     def _residuals(self, points: FloatArray) -> FloatArray:
         """Residual vectors of forces at points or footprints, (RESIDUAL_ORDER, n, dof)."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
-        key = points.shape, points.tobytes()
-        residuals = self._cache.get(key)
+        residuals = self._cache.get(points)
         if residuals is None:
             force = self._matrices.deflection_at(points).T.toarray()
             mass = self._matrices.mass
@@ -194,9 +194,7 @@ class FiniteElementModes:
                 term[:] = displacement.T / self.largest_truncated
                 force = mass @ term.T
             if residuals.nbytes <= _MAX_KEPT_BYTES:
-                self._cache[key] = residuals
-                if len(self._cache) > _MAX_CACHED:
-                    self._cache.pop(next(iter(self._cache)))
+                self._cache.put(points, residuals)
         return residuals
 
 
@@ -256,8 +254,7 @@ class SpectralModes:
         self.largest_truncated = float(u.max())
         # u / u_c of each truncated mode to the powers 1, 2, ...
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        # By shape and content; other points can share either one.
-        self._cache: dict[tuple[tuple[int, ...], bytes], _PointShapes] = {}
+        self._cache = PointCache[_PointShapes](_MAX_CACHED)
         self._is_softer = False
 
     def alternatives(self) -> list["SpectralModes"]:
@@ -320,11 +317,9 @@ class SpectralModes:
     def _observe(self, points: FloatArray) -> _PointShapes:
         """Return the cached shapes at points or footprints on the plate."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
-        key = points.shape, points.tobytes()
-        if key not in self._cache:
+        point_shapes = self._cache.get(points)
+        if point_shapes is None:
             check_footprints_on_plate(points, length=self._mesh.length, width=self._mesh.width)
-            if len(self._cache) >= _MAX_CACHED:
-                self._cache.pop(next(iter(self._cache)))
             degrees = (self._mesh.nx, self._mesh.ny)
             bases = deflections_by_class((self._plate.length, self._plate.width), degrees, points)
             shapes = list[FloatArray]()
@@ -334,12 +329,13 @@ class SpectralModes:
                 mode_count = len(part.eigenvalues)
                 shapes.append(class_shapes[:, :mode_count])
                 truncated.append(class_shapes[:, mode_count:])
-            self._cache[key] = _PointShapes(
+            point_shapes = _PointShapes(
                 shapes=np.hstack(shapes),
                 truncated=np.hstack(truncated),
                 unresolved=unresolved_at(self._local_plate, degrees, points),
             )
-        return self._cache[key]
+            self._cache.put(points, point_shapes)
+        return point_shapes
 
 
 FreeModes: TypeAlias = SpectralModes | FiniteElementModes | SurfaceModes

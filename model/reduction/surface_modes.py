@@ -27,6 +27,7 @@ from functools import cache
 import numpy as np
 
 from model.arrays import FloatArray
+from model.reduction.point_cache import PointCache
 from model.structure.attachments import check_footprints_on_plate, mean_over
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
@@ -113,7 +114,7 @@ class SurfaceModes:
         self._above = max(start + self._spacing * len(elastic), highest)
         self._shift = shift
         self._waves = np.empty((3, 0, 0))
-        self._cache: dict[tuple[tuple[int, ...], bytes], FloatArray] = {}
+        self._cache = PointCache[FloatArray](_MAX_CACHED)
 
     def alternatives(self) -> Iterator["SurfaceModes"]:
         """Yield surfaces that can have the known modes, with as many further modes drawn."""
@@ -130,7 +131,7 @@ class SurfaceModes:
             alternative._waves = np.array([k * np.cos(direction), k * np.sin(direction), phase])
             alternative._powers = np.hstack([self._powers, powers])
             alternative._above = self._above + self._spacing * count
-            alternative._cache = {}
+            alternative._cache = PointCache(_MAX_CACHED)
             yield alternative
 
     @property
@@ -195,17 +196,16 @@ class SurfaceModes:
     def _observe(self, points: FloatArray) -> FloatArray:
         """Shapes of all modes at points or footprints of the surface, drawn ones last, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
-        key = points.shape, points.tobytes()
-        if key not in self._cache:
+        shapes = self._cache.get(points)
+        if shapes is None:
             check_footprints_on_plate(points, **self._sides)
             known = np.asarray(mean_over(self._spline, points, **self._sides))
             phases = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
             waves = math.sqrt(2 / _WAVES) * np.cos(phases).sum(axis=1)
             drawn = self._sizes(known)[:, None] * waves
-            while len(self._cache) >= _MAX_CACHED:
-                self._cache.pop(next(iter(self._cache)))
-            self._cache[key] = np.hstack([known, drawn])
-        return self._cache[key]
+            shapes = np.hstack([known, drawn])
+            self._cache.put(points, shapes)
+        return shapes
 
 
 def _interpolated_shapes(

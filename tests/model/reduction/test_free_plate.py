@@ -4,6 +4,8 @@ The reduced plate, its slopes and its modes, against the full one; a part whose 
 the thickness; modes that differ from the theory, and a loss factor that varies, in every solution.
 """
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -247,6 +249,26 @@ def test_receptances_equal_direct_solve(free):
             (to_points[row], (matrices.deflection_at(points) @ field).T),
         ):
             assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
+
+
+def test_threads_share_the_shapes_at_points():
+    """Eight threads at more sets of points than are kept obtain what one thread obtains."""
+    modes = solve_free_plate(PAPER, SpectralMesh(6, 6, LENGTH, WIDTH), frequency_max=100.0).modes
+    places = [np.array([[0.01 * number, 0.1]]) for number in range(12)]
+    alone = [modes.shapes_at(place) for place in places]
+
+    def visit(first: int) -> None:
+        for number in range(first, first + 150):
+            shapes = modes.shapes_at(places[number % 12])
+            np.testing.assert_array_equal(shapes, alone[number % 12])
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(visit, range(8)))
+    finally:
+        sys.setswitchinterval(interval)
 
 
 MESH = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)

@@ -8,11 +8,11 @@ Solutions for points are then a low-rank correction (`model.structure.attachment
 a system with as many unknowns as points, independent of the mesh.
 
 Receptance. Modes and truncated modes of one solution serve for every modulus, thickness and loss
-factor: with q = (1 + i eta) E h² / (E h²)_solved and modal masses that grow as h,
+factor: with q = (1 + i eta) E h² / (E h²)_solved, z = w² / q and modal masses that grow as h,
 
     h A = sum phi phi' g + sum T_j c_j,   g = 1 / (q lambda - w²),   c = weights(z + shift) / q,
 
-z = w² / q, T_j the sums over the truncated modes. By q it changes as
+where T_j are the sums over the truncated modes. By q it changes as
 
     h dA / d ln q = sum phi phi' (-q lambda g²) + sum T_j (-(c + z dc / dz) / q).
 
@@ -21,11 +21,11 @@ All stiffness of a plate is assumed to scale with E h³ and all its mass with h 
 for a thin plate. Shear, rotary inertia and the edge layers change the response of the paper's plate
 by 0.1 % for 2 % of thickness, and by 0.3 % for 5 %.
 
-Truncated modes. A mode with eigenvalue lambda has the receptance 1 / ((1 + i eta)(lambda - z)), z =
-omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) instead,
-two solves u², and so on. All truncated modes have u within (0, u_c], where u_c belongs to the
-lowest. So u / (1 - s u), s = z + sigma, is approximated on that interval by a polynomial in u
-without constant term. The optimum follows from Chebyshev's; its relative error for each mode is
+Truncated modes. A mode with eigenvalue lambda has the receptance 1 / (q (lambda - z)). A static
+solve with the shift sigma gives u = 1 / (lambda + sigma) instead, two solves u², and so on. All
+truncated modes have u within (0, u_c], where u_c belongs to the lowest. So u / (1 - s u), s = z +
+sigma, is approximated on that interval by a polynomial in u without constant term. The optimum
+follows from Chebyshev's; its relative error for each mode is
 
     T_k(t(u)) / T_k(t(1 / s)),    t(u) = 2 u / u_c - 1,
 
@@ -481,9 +481,11 @@ class FreePlate:
 
         places (c, 2) or footprints (c, 3), points (p, 2) [m]; of the free plate with its loads, and
         of plates so many times as thick (...). Layouts of ERAs at these places are then solved by
-        systems as small as their number of ERAs. Raises InputError as `acceleration`.
+        systems as small as their number of ERAs. Raises InputError as `acceleration`, and for a
+        plate so thin that its truncated modes begin below a frequency.
         """
         omega, count = self._omega(frequencies), len(places)
+        self._check_truncated_modes(omega, thickness)
         footprints = np.vstack([as_footprints(places), footprints_of(loads)])
         stiffness = np.pad(attached_stiffness(omega, loads), ((0, 0), (count, 0)))
         applied = np.eye(len(footprints), count, dtype=complex)
@@ -537,6 +539,20 @@ class FreePlate:
         return FreeReceptance(
             omega, thickness, q, stiffness, self.shift, self.modes.largest_truncated
         )
+
+    def _check_truncated_modes(self, omega: FloatArray, thickness: FloatArray | float) -> None:
+        """Raise InputError if truncated modes of a plate so many times as thick begin below omega.
+
+        The frequencies of modes are proportional to the thickness.
+        """
+        lowest_truncated = 1 / self.modes.largest_truncated - self.shift
+        thinnest = np.min(thickness)
+        least = omega.max(initial=0.0) / math.sqrt(lowest_truncated)
+        if not thinnest > least:
+            raise InputError(
+                f"thickness must be above {least:.3g} times that of the solved plate at "
+                f"{omega.max() / (2 * math.pi):g} Hz, got {thinnest:g}; solve that plate"
+            )
 
     @cached_property
     def _elasticity(self) -> ModalElasticity:

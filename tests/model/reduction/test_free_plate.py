@@ -253,6 +253,18 @@ def test_receptances_equal_direct_solve(free):
 
 def test_threads_share_the_shapes_at_points():
     """Eight threads at more sets of points than are kept obtain what one thread obtains."""
+@pytest.mark.parametrize("thickness", [0.4, np.array([1.0, 0.4]), np.nan])
+def test_receptances_refuse_a_plate_whose_truncated_modes_resonate(free, thickness):
+    """At half the thickness, the first mode that is not kept falls from above 1000 to above 500 Hz.
+
+    At 0.4 times the thickness, it falls below 500 Hz.
+    """
+    places = np.array([[0.1, 0.1]])
+    with pytest.raises(InputError, match=r"^thickness must be above 0\.4.* got (0\.4|nan);"):
+        free.receptances(places, places, np.array([500.0]), thickness=thickness)
+    assert free.receptances(places, places, np.array([500.0]), thickness=0.5)
+
+
     modes = solve_free_plate(PAPER, SpectralMesh(6, 6, LENGTH, WIDTH), frequency_max=100.0).modes
     places = [np.array([[0.01 * number, 0.1]]) for number in range(12)]
     alone = [modes.shapes_at(place) for place in places]

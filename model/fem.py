@@ -202,8 +202,10 @@ class Mesh(Discretisation):
 
     @property
     def element_size(self) -> tuple[float, float]:
-        """Side lengths (dx, dy) of the nx by ny elements, the largest ones [m]."""
-        return (self.length - 2 * self.strip) / self.nx, (self.width - 2 * self.strip) / self.ny
+        """Largest side lengths (dx, dy) of its elements [m], strips included."""
+        dx = (self.length - 2 * self.strip) / self.nx
+        dy = (self.width - 2 * self.strip) / self.ny
+        return max(dx, self.strip), max(dy, self.strip)
 
     @cached_property
     def along(self) -> tuple[ElementRow, ElementRow]:

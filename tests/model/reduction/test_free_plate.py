@@ -22,7 +22,7 @@ from model.errors import InputError
 from model.estimate.forward import ForwardModel, Sensor
 from model.estimate.sensed_plate import sensed_plate
 from model.estimate.space import space_of
-from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
+from model.fem import ELEMENTS, MITC4, Mesh, PlateMatrices, assemble
 from model.finger import Grid
 from model.reduction import free_plate
 from model.reduction.free_plate import (
@@ -207,8 +207,10 @@ def test_modes_and_truncated_ones_respond_as_the_direct_solution(name):
         (0.0, 0.1, (12, 9), "^frequency must be"),
         (float("nan"), 0.1, (12, 9), "^frequency must be"),
         (501.0, 0.1, (12, 9), "^frequency must be"),
-        # The wave at 450 Hz is 180 mm, an element 51 mm; six nodes to a wavelength are needed.
+        # The wave at 450 Hz is 180 mm, an element 51 mm, a strip 40 mm; six nodes to a wavelength
+        # are needed.
         (450.0, 0.1, (6, 5), "resolves, got 450 Hz"),
+        (450.0, 0.1, (12, 9, MITC4, 0.04), "resolves, got 450 Hz"),
         (100.0, LENGTH + 0.01, (12, 9), "must be on the plate"),
         (100.0, -0.01, (12, 9), "must be on the plate"),
     ],
@@ -218,7 +220,7 @@ def test_acceleration_refuses_values_out_of_range(frequency, x, mesh, message):
 
     The mesh of another plate is refused with both sizes.
     """
-    free = solve_free_plate(PAPER, Mesh(*mesh, LENGTH, WIDTH))
+    free = solve_free_plate(PAPER, Mesh(*mesh[:2], LENGTH, WIDTH, *mesh[2:]))
     eras, frequencies = random_eras(np.random.default_rng(0), 3), np.array([100.0, frequency])
     with pytest.raises(InputError, match=message):
         free.acceleration(eras, frequencies, np.array([[x, 0.1]]))

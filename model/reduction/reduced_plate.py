@@ -135,10 +135,13 @@ class ReducedPlate:
     def projection_from(self, other: "ReducedPlate") -> FloatArray:
         """M-orthogonal projection of another reduction's coordinates onto its own, (r, other's r).
 
-        Exact if it has all points of the other. Both must come from the same free plate.
+        Exact if it has all points of the other. Both must come from the same free plate. If only
+        the coordinates of both are known, they are the same ones.
         """
-        if self.origin is None or other.origin is None:
+        if self.origin is None and other.origin is None:
             return np.eye(len(self.omega))
+        if self.origin is None or other.origin is None:
+            raise ValueError("only the coordinates of one of the plates are known")
         modes = len(self.origin.free.modes.eigenvalues)
         projection = np.zeros((len(self.omega), len(other.omega)))
         projection[:modes, :modes] = np.eye(modes)

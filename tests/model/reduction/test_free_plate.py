@@ -253,8 +253,6 @@ def test_receptances_equal_direct_solve(free):
             assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
 
 
-def test_threads_share_the_shapes_at_points():
-    """Eight threads at more sets of points than are kept obtain what one thread obtains."""
 @pytest.mark.parametrize("thickness", [0.4, np.array([1.0, 0.4]), np.nan])
 def test_receptances_refuse_a_plate_whose_truncated_modes_resonate(free, thickness):
     """At half the thickness, the first mode that is not kept falls from above 1000 to above 500 Hz.
@@ -267,6 +265,8 @@ def test_receptances_refuse_a_plate_whose_truncated_modes_resonate(free, thickne
     assert free.receptances(places, places, np.array([500.0]), thickness=0.5)
 
 
+def test_threads_share_the_shapes_at_points():
+    """Eight threads at more sets of points than are kept obtain what one thread obtains."""
     modes = solve_free_plate(PAPER, SpectralMesh(6, 6, LENGTH, WIDTH), frequency_max=100.0).modes
     places = [np.array([[0.01 * number, 0.1]]) for number in range(12)]
     alone = [modes.shapes_at(place) for place in places]
@@ -317,6 +317,16 @@ def test_reduced_plate_response_equals_direct_solve(places):
 
 SIDES = np.array([0.3, 0.2])
 WAVES = np.array([[20.0, 0.0], [35.0, -60.0], [0.0, 90.0]])  # rad/m
+
+
+def test_projection_needs_the_origin_of_both_reductions() -> None:
+    """Between a reduction and one of which only coordinates are known, none is guessed."""
+    known = reduce_plate(PAPER, MESH, np.array(CORNERS))
+    unknown = replace(known, origin=None)
+    for own, other in ((known, unknown), (unknown, known)):
+        with pytest.raises(ValueError, match="only the coordinates of one"):
+            own.projection_from(other)
+    np.testing.assert_allclose(known.projection_from(known), np.eye(len(known.omega)), atol=1e-6)
 
 
 def test_slopes_are_those_of_waves() -> None:

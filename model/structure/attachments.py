@@ -303,7 +303,10 @@ class Fingertip:
         w = np.asarray(omega)
         pulp = self.stiffness + 1j * w * self.damping
         phalanx = self.joint_stiffness + 1j * w * self.joint_damping - w**2 * self.phalanx_mass
-        return np.asarray(pulp * phalanx / (pulp + phalanx) - w**2 * self.contact_mass)
+        total = pulp + phalanx
+        # At omega = 0, a pulp and a joint without stiffness transmit no force.
+        in_series = pulp * phalanx / np.where(total == 0, 1.0, total)
+        return np.asarray(in_series - w**2 * self.contact_mass)
 
     def scaled(self, factor: float) -> "Fingertip":
         """The fingertip with a contact larger by a factor: its pulp and contact mass scale.

@@ -430,8 +430,9 @@ HERTZ = np.array([60.0, 100.0, 250.0])
         (Fingertip(), HERTZ, [69, -87, -358]),
         (Fingertip(phalanx_mass=1e9), HERTZ, [972, 921, 507]),
         (Fingertip().scaled(2), np.zeros(1), [2000 * 500 / 2500]),
+        (Fingertip(stiffness=0.0, joint_stiffness=0.0), np.zeros(1), [0]),
     ],
-    ids=["phalanx that moves", "phalanx at rest", "twice the contact at rest"],
+    ids=["phalanx that moves", "phalanx at rest", "twice the contact at rest", "no springs"],
 )
 def test_dynamic_stiffness_of_a_fingertip(
     fingertip: Fingertip, hertz: FloatArray, expected: list[float]

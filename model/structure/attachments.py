@@ -37,7 +37,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError, expect_values
 from model.structure.plate import Plate
-from model.structure.surface import centre_of_surface
+from model.structure.surface import centre_of_surface, moments_of_surface
 from registry.limits import HAND_LOAD, MAX_FINGER_LOAD
 
 Gain: TypeAlias = tuple[float, float, float]
@@ -647,15 +647,29 @@ def rigid_body_frequencies(
 ) -> FloatArray:
     """Natural frequencies (3,) [Hz] of the rigid plate on its springs, ascending.
 
-    Heave and two tilts: w = q0 + q1 (x - L/2) + q2 (y - W/2). K = sum k p p', M = plate + sum m
-    p p' with p = (1, x - L/2, y - W/2). A mode that no spring holds has frequency 0.
+    Heave and two tilts: w = q' p with p = (1, x/L - 1/2, y/W - 1/2). K = sum k p p', M = plate +
+    sum m p p'. A mode that no spring holds has frequency 0.
     """
     p, stiffness, mass = _attached(plate, eras, loads)
     K = (p * stiffness) @ p.T
-    M = (p * mass) @ p.T + np.diag(plate.rigid_masses)
+    M = (p * mass) @ p.T + _rigid_mass_matrix(plate)
     inverse = np.linalg.inv(np.linalg.cholesky(M))
     eigenvalues = np.linalg.eigvalsh(inverse @ K @ inverse.T)
     return np.asarray(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2 * np.pi))
+
+
+def _rigid_mass_matrix(plate: Plate) -> FloatArray:
+    """Return the mass matrix (3, 3) [kg] of the bare rigid plate in p = (1, x/L - 1/2, y/W - 1/2).
+
+    A surface whose modes show its moments can have its center of mass and its inertia anywhere.
+    """
+    moments = None if plate.surface is None else moments_of_surface(plate.surface)
+    if moments is None:
+        return np.diag(plate.rigid_masses)
+    to_sides = np.array(
+        [[1.0, 0.0, 0.0], [-0.5, 1 / plate.length, 0.0], [-0.5, 0.0, 1 / plate.width]]
+    )
+    return np.asarray(plate.mass * to_sides @ moments @ to_sides.T)
 
 
 def static_loads(

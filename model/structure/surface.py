@@ -142,14 +142,26 @@ def digest_of_file(path: Path) -> str:
 
 def centre_of_surface(surface: Surface) -> Point | None:
     """Return the center of mass [m] of a surface; None unless its rigid body is free to tilt."""
+    moments = moments_of_surface(surface)
+    if moments is None:
+        return None
+    x, y = moments[0, 1:].tolist()
+    return x, y
+
+
+def moments_of_surface(surface: Surface) -> FloatArray | None:
+    """Return the mean of p p' over the mass of a surface (3, 3) with p = (1, x, y) [m].
+
+    None unless its rigid body is free to tilt.
+    """
     if surface.rigid < _TILTING:
         return None
-    return _centre(surface.file, surface.digest, surface.normal)
+    return _moments(surface.file, surface.digest, surface.normal)
 
 
 @lru_cache(maxsize=4)
-def _centre(file: str, digest: str, normal: str) -> Point | None:
-    """Compute the center of mass [m] of a free surface from its rigid modes.
+def _moments(file: str, digest: str, normal: str) -> FloatArray | None:
+    """Compute the moments of a free surface, relative to its mass, from its rigid modes.
 
     Modes of unit modal mass are P T, where P has a row (1, x, y) for each node: then the mass and
     the first and second moments of the surface are (T T')^-1.
@@ -160,8 +172,7 @@ def _centre(file: str, digest: str, normal: str) -> Point | None:
     if rank < _TILTING or np.linalg.matrix_rank(factors) < _TILTING:
         return None
     moments = np.linalg.inv(factors @ factors.T)
-    x, y = (moments[0, 1:] / moments[0, 0]).tolist()
-    return x, y
+    return np.asarray(moments / moments[0, 0])
 
 
 @lru_cache(maxsize=4)

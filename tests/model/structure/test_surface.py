@@ -29,7 +29,12 @@ from model.errors import InputError
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
-from model.structure.attachments import GRAVITY, centre_of_mass, static_loads
+from model.structure.attachments import (
+    GRAVITY,
+    centre_of_mass,
+    rigid_body_frequencies,
+    static_loads,
+)
 from model.structure.surface import is_within, rings_of
 from model.study.exact_plates import amplitudes_on, draw_plates
 from model.study.verification import verify_table
@@ -162,6 +167,19 @@ def test_surface_has_the_centre_of_mass_of_its_modes(
     assert GRAVITY * whole == pytest.approx(static_loads(rig.plate, rig.eras).sum(), rel=1e-3)
     moments = static_loads(rig.plate, rig.eras) @ [(era.x, era.y) for era in rig.eras]
     assert moments / (GRAVITY * whole) == pytest.approx(expected, rel=1e-3)
+    # A uniform rectangle has the inertia m L² / 12 about its middle.
+    sides = 2 * middle
+    arms = np.array([[era.x, era.y] for era in rig.eras]) - middle
+    arm = modes["nodes"][node, :2] - middle
+    springs = np.array([era.stiffness for era in rig.eras])
+    p = np.column_stack([np.ones(len(arms)), arms])
+    node_p = np.array([1.0, *arm])
+    inertia = PAPER.plate.mass * np.diag([1.0, *(sides**2 / 12)]) + mass * np.outer(node_p, node_p)
+    bolts = np.array([era.support.mass for era in rig.eras])
+    inertia += p.T @ (bolts[:, None] * p)
+    squares = scipy.linalg.eigh(p.T @ (springs[:, None] * p), inertia, eigvals_only=True)
+    rocking = rigid_body_frequencies(rig.plate, rig.eras)
+    assert rocking == pytest.approx(np.sqrt(squares) / (2 * np.pi), rel=1e-3)
     plain = load_rig(_write(tmp_path, modes))
     assert centre_of_mass(plain.plate) == pytest.approx(middle, abs=1e-5)
 

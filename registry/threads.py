@@ -62,8 +62,7 @@ async def in_thread(
 def _run(
     work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
 ) -> None:
-    """Do work and store its result or error; it counts as running until then."""
-    _at_work.add(done)
+    """Do work of `_at_work` and store its result or error; it counts as running until then."""
     try:
         _note_result(work, done, undo)
     finally:
@@ -73,18 +72,31 @@ def _run(
 def _note_result(
     work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None
 ) -> None:
-    """Store the result of work, or its error; undo: called with the result of cancelled work."""
+    """Store the result of work, or its error; undo: called with the result of cancelled work.
+
+    An attempt to end the program, such as sys.exit(), becomes a RuntimeError.
+    """
     try:
         result = work()
     except Exception as error:
-        with suppress(InvalidStateError):  # cancelled
-            done.set_exception(error)
+        _note_error(error, done)
+        return
+    except BaseException as error:
+        failure = RuntimeError(f"work in a thread must return or fail, got {error!r}")
+        failure.__cause__ = error
+        _note_error(failure, done)
         return
     try:
         done.set_result(result)
     except InvalidStateError:
         if undo is not None:
             undo(result)
+
+
+def _note_error(error: Exception, done: "Future[_T]") -> None:
+    """Store the error of work that was not cancelled."""
+    with suppress(InvalidStateError):
+        done.set_exception(error)
 
 
 def are_at_work() -> bool:
@@ -110,8 +122,13 @@ class DaemonThreads(ThreadPoolExecutor):
     def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
         """Start work immediately."""
         done: Future[_T] = Future()
-        # `threading` would wait until the thread runs, a millisecond on a busy machine.
-        _thread.start_new_thread(_run, (partial(work, *args, **named), done))
+        _at_work.add(done)
+        try:
+            # `threading` would wait until the thread runs, a millisecond on a busy machine.
+            _thread.start_new_thread(_run, (partial(work, *args, **named), done))
+        except RuntimeError:  # the system has no more threads
+            _at_work.discard(done)
+            raise
         return done
 
 

@@ -5,12 +5,21 @@ import gc
 import subprocess
 import sys
 import threading
+from collections.abc import Awaitable
 from itertools import islice
 
 import pytest
 
 from registry.plugins import did_you_mean
-from registry.threads import Backoff, in_thread, no_long_collections, pauses, without_collections
+from registry.threads import (
+    Backoff,
+    DaemonThreads,
+    are_at_work,
+    in_thread,
+    no_long_collections,
+    pauses,
+    without_collections,
+)
 
 
 async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
@@ -51,6 +60,35 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
     asyncio.run(give_up())
     may_open.set()
     assert closed.wait(60)
+
+
+@pytest.mark.parametrize("executor", [None, DaemonThreads()], ids=["in_thread", "executor"])
+async def test_awaiter_learns_when_work_tries_to_end_the_program(
+    executor: DaemonThreads | None,
+) -> None:
+    """A plug-in that calls sys.exit(3) fails as any other, and nothing waits for it."""
+
+    def leave() -> None:
+        sys.exit(3)
+
+    work: Awaitable[None]
+    if executor is None:
+        work = in_thread(leave, name="leaves")
+    else:
+        work = asyncio.wrap_future(executor.submit(leave))
+    with pytest.raises(RuntimeError, match=r"SystemExit\(3\)"):
+        await asyncio.wait_for(work, timeout=10)
+
+
+def test_work_counts_before_its_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if the scheduler has not run the thread yet when the program ends."""
+    waiting = []
+    monkeypatch.setattr("_thread.start_new_thread", lambda run, given: waiting.append((run, given)))
+    DaemonThreads().submit(int)
+    assert are_at_work()
+    ((run, given),) = waiting
+    run(*given)
+    assert not are_at_work()
 
 
 @pytest.mark.parametrize(

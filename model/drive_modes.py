@@ -487,7 +487,7 @@ def find_switched(forms: Forms) -> list[tuple[float, WeightedTones]]:
     """
     powers = _pattern_powers(forms)
     bounds = _pattern_bounds(forms, powers)
-    first_era, second_era = np.triu_indices(forms.era_count, 1)
+    first_era, second_era = _era_pairs(forms.era_count)
     bound = bounds.ravel()
     count = BATCH
     while True:
@@ -534,8 +534,9 @@ def _pattern_bounds(forms: Forms, powers: Float32Array) -> Float32Array:
     mean_target = target_powers.mean(axis=0)
     target, quiet = _sums_of_pairs(np.stack([mean_target, mean_quiet]))
     bounds = np.asarray(target / np.maximum(quiet, _LEAST_POWER))
-    first_era, second_era = np.triu_indices(forms.era_count, 1)
+    first_era, second_era = _era_pairs(forms.era_count)
     # An ERA alone counts once.
+    bounds[first_era == second_era, :, 1:] = -1
     bounds[first_era + 1 < second_era, :, 0] = -1
     bounds[:-1, 0] = -1
     return bounds
@@ -591,12 +592,25 @@ def _sums_of_pairs(powers: Float32Array) -> Float32Array:
 
     By the frequency of each ERA; powers `_with_silence`.
     """
-    first, second = np.triu_indices(powers.shape[-1], 1)
+    first, second = _era_pairs(powers.shape[-1])
     alone = np.diagonal(powers, axis1=2, axis2=3).swapaxes(1, 2)
     sums = alone[:, first, :, None] + alone[:, second, None]
     rows = np.arange(powers.shape[1])
     sums[:, :, rows, rows] += 2 * powers[:, :, first, second].swapaxes(1, 2)
+    sums[:, first == second, :, 1:] = 0
     return sums
+
+
+def _era_pairs(era_count: int) -> tuple[IntArray, IntArray]:
+    """Return the two ERAs (pairs,) of each pattern.
+
+    An only ERA is paired with itself, and plays as the first of the two alone.
+    """
+    if era_count == 1:
+        only = np.zeros(1, dtype=np.intp)
+        return only, only
+    first, second = np.triu_indices(era_count, 1)
+    return first, second
 
 
 def _drive(tones: list[list[int]], eras: int) -> WeightedTones:

@@ -204,6 +204,20 @@ def test_max_sensation_includes_two_tones():
     assert HIGHEST["phased"](given) == pytest.approx(sums.max(), rel=1e-4)
 
 
+def test_an_only_era_is_switched_at_its_best_frequency():
+    """By hand: contrasts of 2, 4, 3 and of 8 below the level; the highest level is 5."""
+    target = np.array([2, 4, 3, 0.8], dtype=np.complex64).reshape(1, 4, 1)
+    quiet = np.array([1, 1, 1, 0.01], dtype=np.complex64).reshape(4, 1, 1, 1)
+    threshold = np.array([1, 1, 0.6, 1], dtype=np.float32)
+    power = (target * target)[..., None]
+    given = Forms(target, power, quiet, threshold, wanted=1.5, level_margin=0.0)
+    found = drive_modes.find_switched(given)
+    assert [score for score, _ in found] == pytest.approx([4, 3, 2])
+    assert [drive[0][0] for _, drive in found] == [1, 2, 0]
+    assert [drive[0][1].tolist() for _, drive in found] == [[1]] * 3
+    assert HIGHEST["switched"](given) == pytest.approx(5.0)
+
+
 @pytest.mark.parametrize(
     ("level_step", "phase_step", "richest"),
     [

@@ -498,8 +498,9 @@ def best_combination(
 ) -> tuple[IntArray, bool]:
     """Choose a candidate for each content (K,); also return whether their frequencies are apart.
 
-    Contents swap bands if they have several. Combinations with separate frequencies come first;
-    others are used only without any.
+    Contents swap bands if they have several. Combinations are extended content by content, and
+    only the best `contents.combinations` are kept. Frequencies may be closer than
+    `contents.apart_hz` only if no kept combination can be extended otherwise.
     """
     streams = contents.streams
     sensitivities = table.sensitivities[:, candidates.rows]

@@ -98,11 +98,24 @@ class Course:
     @cached_property
     def strongest_db(self) -> float:
         """RMS of its strongest moments [dB], relative to a constant 1."""
-        times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
-        samples = np.maximum(self.at(times), SILENCE)
-        count = round(STRONGEST / self.step)
-        mean_squares = np.convolve(samples**2, np.full(count, 1 / count))
-        return float(10 * np.log10(mean_squares.max()))
+        knots, _ = self._line
+        steps = self.step * np.arange(self.duration / self.step + 1)
+        starts = np.concatenate([steps, knots, knots - STRONGEST])
+        energies = self._energy_until(starts + STRONGEST) - self._energy_until(starts)
+        mean_square = max(float(energies.max()) / STRONGEST, SILENCE**2)
+        return 10 * math.log10(mean_square)
+
+    def _energy_until(self, times: FloatArray) -> FloatArray:
+        """Return the integral of the squared fraction from 0 to times [s] (n,)."""
+        knots, shares = self._line
+        products = shares[:-1] ** 2 + shares[:-1] * shares[1:] + shares[1:] ** 2
+        until_knot = np.append(0.0, np.cumsum(np.diff(knots) * products / 3))
+        times = np.clip(times, 0.0, self.duration)
+        before = np.searchsorted(knots, times, side="right") - 1
+        first = shares[before]
+        last = self.at(times)
+        products = first**2 + first * last + last**2
+        return np.asarray(until_knot[before] + (times - knots[before]) * products / 3)
 
     @cached_property
     def swings(self) -> tuple[Swing, ...]:
@@ -114,11 +127,26 @@ class Course:
         for step in (COURSE_KNOT_STEP, 2 * COURSE_KNOT_STEP, 4 * COURSE_KNOT_STEP):
             knot_count = math.ceil(self.duration / step) + math.ceil(DECAYED / step)
             times = np.asarray(step * np.arange(1, knot_count + 1), dtype=float)
-            once = np.where(times < self.duration, self.at(times), 0.0)
+            once = self._played_at(times)
             repeated = self.at(np.mod(times, self.duration))
             shares = (0.0, *once.tolist(), *repeated.tolist())
             swings.append(Swing(shares, step))
         return tuple(swings)
+
+    def played(self, times: FloatArray) -> FloatArray:
+        """Return fractions (n,) at times [s] as amplifiers play them once, from knot to knot.
+
+        They begin at silence, which the first knot ends, and return to it after the last knot.
+        """
+        knot_count = math.ceil(self.duration / COURSE_KNOT_STEP)
+        knots = np.asarray(COURSE_KNOT_STEP * np.arange(1, knot_count + 1), dtype=float)
+        shares = self._played_at(knots)
+        fractions = np.interp(times, np.append(0.0, knots), np.append(0.0, shares), right=0.0)
+        return np.asarray(fractions)
+
+    def _played_at(self, knots: FloatArray) -> FloatArray:
+        """Return fractions at the knots [s] (n,) of one playback, 0 from its end on."""
+        return np.where(knots < self.duration, self.at(knots), 0.0)
 
     def at(self, times: FloatArray) -> FloatArray:
         """Return fractions at times [s] (n,), 0 outside."""
@@ -209,13 +237,10 @@ class DriveEnvelope:
 
     @classmethod
     def of_course(cls, course: Course) -> "DriveEnvelope":
-        """Build the envelope of a course, with a plain ramp if it starts or ends above 0."""
+        """Build the envelope of a course as it is played."""
         count = math.ceil((course.duration + _RINGING) / course.step)
         times = np.asarray(course.step * np.arange(count), dtype=float)
-        times_after = times - course.duration
-        values = course.at(times) - course.shares[0] * (1 - rise(times, ONSET_RAMP))
-        fall = course.shares[-1] * (1 - rise(times_after, ONSET_RAMP))
-        values += np.where(times_after > 0, fall, 0.0)
+        values = course.played(times)
         within = round(STRONGEST / course.step)
         return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
 

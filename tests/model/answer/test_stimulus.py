@@ -22,7 +22,7 @@ from kit.plates import (
 )
 from kit.set_table import only, phased, wants
 from model.answer import tone_search
-from model.answer.envelope import Course, DriveEnvelope, pulse_ramp
+from model.answer.envelope import COURSE_KNOT_STEP, Course, DriveEnvelope, pulse_ramp
 from model.answer.plan import answer, query
 from model.answer.promise import share_stroke
 from model.answer.question import Contents, Stream
@@ -71,15 +71,26 @@ def test_strongest_moments_of_a_course() -> None:
     # Over 20 ms on each side of the peak the mean of (1 - t / 40 ms)² is 7/12.
     assert triangle.strongest_db == pytest.approx(10 * math.log10(7 / 12), abs=0.1)
     assert along(0.5, np.zeros(3)).strongest_db == pytest.approx(-120)
+    # A rise from 0 to 1 within 2 ms has a mean square of 1/3, over 40 ms of 1/60.
+    brief = Course((0.0, 0.002), (0.0, 1.0))
+    assert brief.strongest_db == pytest.approx(-10 * math.log10(60), abs=1e-6)
+
+
+def test_a_decaying_course_is_predicted_as_it_is_played() -> None:
+    """By hand: knots 10 ms apart are at 0.5 and 0, and playback rises from silence to the first."""
+    predicted = DriveEnvelope.of_course(Course((0.0, 0.02), (1.0, 0.0)))
+    assert predicted.step == 0.0025
+    in_steps_of_5_ms = predicted.values[:12:2]
+    assert in_steps_of_5_ms == pytest.approx([0, 0.25, 0.5, 0.25, 0, 0], abs=1e-5)
 
 
 def test_a_sinusoidal_modulation_has_three_tones() -> None:
     """Of beats that come and go along a raised cosine of 8 s.
 
-    Each side tone has half of the amplitude of the carrier, a quarter of its power. Next to a null
-    little is felt of slow changes: side bands at 2 Hz are a fifth of the way to the next tone, of
-    whose power they cause 1/25. At the top of a beat the carrier has half of the amplitude, each
-    side band a quarter.
+    Each side tone has half of the amplitude of the carrier, less what playback along lines between
+    knots takes away. Next to a null little is felt of slow changes: side bands at 2 Hz are a fifth
+    of the way to the next tone, of whose power they cause 1/25. At the top of a beat the carrier
+    has half of the amplitude, each side band a quarter.
     """
     off, times = np.arange(-60.0, 61.0, 10.0), np.linspace(0, 8.0, 1601)
     slow = (1 - np.cos(2 * np.pi * times / 8.0)) / 2
@@ -89,7 +100,9 @@ def test_a_sinusoidal_modulation_has_three_tones() -> None:
         ).shares_at(off)
         for frequency in (20.0, 2.0)
     )
-    expected = 0.25 * (np.abs(off) == 20) + (off == 0)
+    # A sinusoid at its knots, and at the middle of each line between two of them.
+    played = (1 + np.cos(np.pi * 20 * COURSE_KNOT_STEP)) / 2
+    expected = (played / 2) ** 2 * (np.abs(off) == 20) + (off == 0)
     assert quick / quick.max() == pytest.approx(expected, abs=0.01)
     assert hardly[np.abs(off) == 10] == pytest.approx(0.25**2 / 25, rel=0.1)
 
@@ -112,7 +125,12 @@ def test_a_course_is_felt_as_on_the_plate_in_time(
     frequencies, bases = base_amplitudes(drive, table.eras)
     found = ringing.over(zip(frequencies.tolist(), bases, strict=True))
     envelopes = {
-        name: BaseEnvelope(frequency, 0j, tuple(tone.phasor * each for each in course.shares[1:]))
+        name: BaseEnvelope(
+            frequency,
+            0j,
+            tuple(tone.phasor * each for each in course.shares[2::2]),  # of knots 5 ms apart
+            COURSE_KNOT_STEP,
+        )
         for name, tone in drive.items()
     }
     points = [fingertip_points(*at, table.plate) for at in (TARGET, QUIET)]

@@ -202,7 +202,7 @@ def decoded(source: str, content: bytes) -> str:
 
 
 def parse_document(
-    source: str, text: str, *, if_empty: str = IF_EMPTY, max_values: int = MAX_DOCUMENT_VALUES
+    source: str, text: str, *, if_empty: str = IF_EMPTY, max_values: int | None = None
 ) -> Document:
     """Read the text of a YAML file that came from a source; raises ConfigError."""
     forbidden = _NOT_ALLOWED.search(text)
@@ -210,7 +210,7 @@ def parse_document(
         line = text.count("\n", 0, forbidden.start()) + 1
         message = f"character U+{ord(forbidden[0]):04X} is not allowed in YAML; remove it"
         raise ConfigError(source, [ConfigProblem(line, "", message)])
-    reader = _PlainReader(source, text, max_values)
+    reader = _PlainReader(source, text, max_values or MAX_DOCUMENT_VALUES)
     try:
         data = reader.document()
     except yaml.MarkedYAMLError as error:

@@ -273,7 +273,7 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         assert (await next_event(era, "state")).data["epoch"] < epoch
         await era.clear()
         supervisor = bench.daemon.supervisor
-        supervisor.operation = replace(supervisor.operation, epoch=0)
+        supervisor.current.value = replace(supervisor.operation, epoch=0)
         for connection in list(bench.daemon.server.clients):
             connection.abort()
         await era.stop()

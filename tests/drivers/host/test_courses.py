@@ -270,12 +270,12 @@ class OnLines(Taken):
     def misses_all_parts(self) -> None:
         """Let the first amplifier say that no part of a set has come."""
         said = {"exact": 0, "staged": 0, "played": 0, "missing": 0}
-        self.far.a.take_part = lambda part, now: {**said, "token": part["token"]}
+        self.far.a._take_part = lambda part, now: {**said, "token": part["token"]}
 
     def says_other_tokens(self, count: int) -> None:
         """Let the first amplifier take so many parts under another token."""
-        take, left = self.far.a.take_part, [1] * count
-        self.far.a.take_part = lambda part, now: (
+        take, left = self.far.a._take_part, [1] * count
+        self.far.a._take_part = lambda part, now: (
             take(part, now) | {"token": part["token"] ^ (left.pop() if left else 0)}
         )
 
@@ -421,7 +421,7 @@ class OnLines(Taken):
     def rounds(self, **steps: int) -> None:
         """Let the first amplifier play multiples of steps alone, and say that no set is exact."""
         far = self.far.a
-        commit, take = far.playback.commit, far.take_part
+        commit, take = far.playback.commit, far._take_part
 
         def rounded(tone: Command) -> Command:
             shares = {
@@ -432,7 +432,7 @@ class OnLines(Taken):
         far.playback.commit = lambda layers, *when: commit(
             [replace(each, commands=tuple(map(rounded, each.commands))) for each in layers], *when
         )
-        far.take_part = lambda part, now: {**take(part, now), "exact": 0}
+        far._take_part = lambda part, now: {**take(part, now), "exact": 0}
 
     def says_frequency(self, said: int) -> None:
         """Let the first amplifier say a frequency of all tones that it achieves."""

@@ -109,9 +109,9 @@ def test_amplifier_with_the_whole_table_passes_loud(names: list[str]) -> None:
 class _Coarse(SimulatedAmplifier):
     """An amplifier that keeps its own steps, of frequency from its lowest one on, and says so."""
 
-    def play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
         played = [replace(one, commands=tuple(map(self._rounded, one.commands))) for one in layers]
-        super().play(played, token, now)
+        super()._play(played, token, now)
 
     def _rounded(self, tone: Command) -> Command:
         if not tone.level:
@@ -128,8 +128,8 @@ class _Coarse(SimulatedAmplifier):
             phase=(phase + 18_000) % 36_000 - 18_000,
         )
 
-    def take_part(self, part: Values, now: float) -> Values:
-        return {**super().take_part(part, now), "exact": 0}
+    def _take_part(self, part: Values, now: float) -> Values:
+        return {**super()._take_part(part, now), "exact": 0}
 
 
 OWN_STEPS = [
@@ -216,7 +216,7 @@ def test_level_below_a_step_is_refused() -> None:
 class _PlaysOn(SimulatedAmplifier):
     """An amplifier that plays on after Stop."""
 
-    def silence(self, moment: float, *, ramp: float) -> None:
+    def _silence(self, moment: float, *, ramp: float) -> None:
         if self.state != "OPERATION_ENABLED":
             super().silence(moment, ramp=ramp)
 

@@ -72,7 +72,8 @@ def draw_plates(
 ) -> Plates:
     """Draw plates within an uncertainty.
 
-    Damping, loss, finger loads and feet are log-normal; everything else is normal.
+    Damping, loss, finger loads and feet are log-normal, and springs are normal numbers above zero;
+    everything else is normal.
     """
     era_count, foot_count = len(of.eras), len(feet_of(of.masses))
 
@@ -85,8 +86,10 @@ def draw_plates(
 
     mode_stds = np.array([[uncertainty.mode_frequency], [uncertainty.mode_amplitude]])
     mode_count = MAX_DEVIATING if mode_stds.any() else 0
-    # A generator of their own: the other draws of a seed do not depend on the number of modes.
+    # Generators of their own: the other draws of a seed do not depend on the number of modes, nor
+    # on how many springs are drawn again.
     (mode_rng,) = rng.spawn(1)
+    (redraw_rng,) = mode_rng.spawn(1)
     mode_draws = mode_rng.standard_normal((count, 2, mode_count))
 
     # The draws of a seed depend on their order.
@@ -96,6 +99,9 @@ def draw_plates(
     loss = uncertainty.damping ** normal()
     damping = uncertainty.damping ** normal()
     stiffness = 1 + uncertainty.stiffness * normal(era_count)
+    while (stiffness <= 0).any():
+        redrawn = 1 + uncertainty.stiffness * redraw_rng.standard_normal(stiffness.shape)
+        stiffness = np.where(stiffness > 0, stiffness, redrawn)
     load = np.exp(uncertainty.fingertip * normal(contact_count))
     gain = common_gain * (1 + uncertainty.gain * normal(era_count))
     phase = math.radians(uncertainty.phase_deg) * normal(era_count)

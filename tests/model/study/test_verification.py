@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.stats import kstest, truncnorm
 
 from kit.direct_plate import direct_acceleration
 from kit.outside_files import EXAMPLES
@@ -143,6 +144,15 @@ def test_verify_compares_tones_of_two_frequencies_by_every_threshold_set():
     assert 20 * np.log10(by_own_set[0]) > check.predicted_contrast_db + 0.2
     assert check.direct_contrast_db == pytest.approx(check.predicted_contrast_db, abs=0.02)
     assert check.is_passed
+
+
+def test_springs_of_drawn_plates_are_positive():
+    """At the largest uncertainty they have the distribution of a normal number cut off at 0."""
+    known = replace(Uncertainty(), stiffness=0.5)
+    plates = draw_plates(np.random.default_rng(0), known, of=ON_FEET, count=1000, contact_count=2)
+    assert plates.stiffness.min() > 0
+    expected = truncnorm(-2, np.inf, loc=1, scale=0.5)
+    assert kstest(plates.stiffness.ravel(), expected.cdf).pvalue > 0.01
 
 
 @pytest.mark.parametrize(

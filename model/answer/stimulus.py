@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,9 @@ _UNITS = {
     "max_foreign_db_sl": "dB SL",
 }
 
+_SHARED_BY_ALL = ("duration", "course", "is_limit")
+"""Attributes of a stimulus that are the same for all fingers of one vibration."""
+
 
 @dataclass(frozen=True)
 class Stimulus:
@@ -79,7 +83,10 @@ class Stimulus:
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table; raises InputError."""
         if type(self.band_hz) is not tuple or [*map(type, self.band_hz)] != [float, float]:
-            _check_pair(self.band_hz, what="band_hz", such_as="(40, 120), lowest and highest in Hz")
+            band = _pair(
+                self.band_hz, what="band_hz", such_as="(40, 120), lowest and highest in Hz"
+            )
+            object.__setattr__(self, "band_hz", band)
         if type(self.level_db_sl) is not float:
             expect_number(self.level_db_sl, what="level_db_sl", unit="dB above the threshold")
         low, high = self.band_hz
@@ -111,7 +118,10 @@ def _check_course(course: Course, duration: float | None) -> None:
         raise InputError(
             f"course must be one such as era.Course((0, 0.5), (1, 0)), got {shown(course)}"
         )
-    if duration not in (None, course.duration):
+    if duration is None:
+        return
+    expect_number(duration, what="duration", unit="seconds")
+    if duration != course.duration:
         raise InputError(
             f"duration must be left out for a stimulus with a course, got {duration:g}"
         )
@@ -176,9 +186,10 @@ class Finger:
         """Check everything that does not depend on the table; raises InputError."""
         # Types are tested first: most fingers pass, and calls would take longer.
         if type(self.at) is not tuple or [*map(type, self.at)] != [float, float]:
-            _check_pair(
+            position = _pair(
                 self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in meters"
             )
+            object.__setattr__(self, "at", position)
         for what, unit in _UNITS.items():
             value = getattr(self, what)
             if type(value) is not float:
@@ -225,12 +236,9 @@ class Finger:
             return False
         if NEVER in (self.sharing, other.sharing):
             return False
-        if (
-            stimulus.duration != other_stimulus.duration
-            or stimulus.is_limit != other_stimulus.is_limit
-            or stimulus.course != other_stimulus.course
-        ):
-            return False
+        for what in _SHARED_BY_ALL:
+            if getattr(stimulus, what) != getattr(other_stimulus, what):
+                return False
         if not are_apart or self.sharing == other.sharing == ANY:
             return True
         return self.name is not None and self.name == other.name
@@ -298,6 +306,7 @@ def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     for number, finger in enumerate(fingers):
         for other in fingers[:number]:
             _check_apart(finger, other)
+            _check_alike(finger, other)
 
 
 def _check_apart(finger: Finger, other: Finger) -> None:
@@ -316,6 +325,23 @@ def _check_apart(finger: Finger, other: Finger) -> None:
     )
 
 
+def _check_alike(finger: Finger, other: Finger) -> None:
+    """Raise InputError for two fingers that must feel one vibration but ask for different ones."""
+    stimulus = finger.stimulus
+    other_stimulus = other.stimulus
+    if stimulus is None or other_stimulus is None or not finger.must_feel_one_with(other):
+        return
+    for what in _SHARED_BY_ALL:
+        if getattr(stimulus, what) != getattr(other_stimulus, what):
+            x, y = finger.at
+            other_x, other_y = other.at
+            raise InputError(
+                f"{what} of fingers that must feel one vibration must be the same, got different "
+                f"ones at ({x:g}, {y:g}) and ({other_x:g}, {other_y:g}) m; give their stimuli "
+                "different names"
+            )
+
+
 def check_level(level_db_sl: float) -> None:
     """Raise InputError for a level [dB SL] outside the allowed range."""
     if not MIN_LEVEL_DB_SL <= level_db_sl <= MAX_LEVEL_DB_SL:
@@ -326,8 +352,10 @@ def check_level(level_db_sl: float) -> None:
         )
 
 
-def _check_pair(value: object, *, what: str, such_as: str) -> None:
-    """Raise InputError for anything but two numbers."""
-    pair = value if isinstance(value, Sequence | np.ndarray) else ()
+def _pair(value: object, *, what: str, such_as: str) -> tuple[Any, Any]:
+    """Return two numbers as a tuple; raises InputError for anything else."""
+    numbers = value.tolist() if isinstance(value, np.ndarray) else value
+    pair = tuple(numbers) if isinstance(numbers, Sequence) else ()
     if len(pair) != 2 or not (isinstance(pair[0], Real) and isinstance(pair[1], Real)):
         raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(value)}")
+    return pair

@@ -436,7 +436,26 @@ REFUSED: dict[str, list[Callable[[], object]]] = {
         lambda: asked(duration=1e-9),
         lambda: asked(duration=math.inf),
     ],
-    "duration must be a number": [lambda: asked(duration=10**400)],
+    "duration must be a number": [
+        lambda: asked(duration=10**400),
+        lambda: Stimulus(duration="0.5", course=along(0.5, np.ones(2))),
+    ],
+    "place of a finger must be two numbers": [
+        *(lambda at=at: Finger(at) for at in (np.array(0.1), np.ones((2, 2)), (0.1, "0.1"), {1, 2}))
+    ],
+    "band_hz must be two numbers": [lambda: Stimulus(band_hz=np.array(40.0))],
+    **{
+        f"{what} of fingers that must feel one vibration must be the same": [
+            lambda given=given: of_fingers(
+                Finger(TARGET, Stimulus(name="a"), sharing="must"),
+                Finger(FINGERS_QUIET[0], Stimulus(name="a", **given), sharing="must"),
+            )
+        ]
+        for what, given in {
+            "duration": {"duration": 0.04},
+            "is_limit": {"is_limit": True},
+        }.items()
+    },
     "duration must be left out for a stimulus with a course": [
         lambda: Stimulus(20.0, duration=0.2, course=along(0.5, np.array([0.0, 1.0, 0.0])))
     ],
@@ -475,6 +494,14 @@ def test_what_contradicts_itself_or_has_no_answer_is_refused(said: str) -> None:
     for refused in REFUSED[said]:
         with pytest.raises(InputError, match=said):
             refused()
+
+
+def test_lists_and_arrays_of_two_numbers_become_tuples() -> None:
+    """So that a finger has the same value and hash however its place and band are written."""
+    written = Finger((0.1, 0.2), Stimulus(band_hz=(40.0, 120.0)))
+    lists = Finger([0.1, 0.2], Stimulus(band_hz=[40, 120]))
+    arrays = Finger(np.array([0.1, 0.2]), Stimulus(band_hz=np.array([40, 120])))
+    assert {written, lists, arrays} == {written}
 
 
 @pytest.mark.parametrize(

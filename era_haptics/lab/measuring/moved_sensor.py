@@ -72,13 +72,14 @@ class PositionsFile:
 
     def keep(self, place: WiredSensor, measured: MeasuredResponses) -> None:
         """Write the file with another place; raises OSError."""
-        self.values[place.name] = measured.responses.values[:, 0]
-        places = [sensor for sensor in self.desk.sensors if sensor.name in self.values]
-        values = np.stack([self.values[sensor.name] for sensor in places], axis=1)
+        values_by_name = self.values | {place.name: measured.responses.values[:, 0]}
+        places = [sensor for sensor in self.desk.sensors if sensor.name in values_by_name]
+        values = np.stack([values_by_name[sensor.name] for sensor in places], axis=1)
         measurement = Measurement(
             tuple(sensor.place for sensor in places), self.multisine.frequencies, values
         )
         write_responses(self.path, measurement, self.desk.rig, setting=self.setting)
+        self.values = values_by_name
 
     def _place_at(self, point: Sequence[float]) -> WiredSensor:
         for place in self.desk.sensors:
@@ -112,8 +113,8 @@ def measure_by_moving(
 ) -> tuple[list[str], dict[str, Any], bool]:
     """Guide a person at a terminal through the positions of a desk.
 
-    Return the report, and whether all positions are measured. Raises InputError, LinkError,
-    KeyboardInterrupt, after printing the progress.
+    Return the lines to print, the report, and whether all positions are measured. Raises
+    InputError and LinkError, and KeyboardInterrupt after printing the progress.
     """
     _check_output(output, is_resumed=is_resumed)
     with Stopwatch() as stopwatch, opened as (card, multisine):
@@ -129,6 +130,10 @@ def measure_by_moving(
             raise
         except DeviceLost as problem:
             raise LinkError(f"{problem}; check its cable; {file}") from problem
+        except OSError as problem:
+            raise InputError(
+                f"{output}: cannot be written: {problem.strerror}; {file}"
+            ) from problem
     missing = [place.name for place in file.missing]
     report = {
         "frequencies_hz": multisine.frequencies.tolist(),

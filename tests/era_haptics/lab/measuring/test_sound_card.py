@@ -37,6 +37,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad
 from processes.gateways import wait_for
+from processes.interrupted import full_disk
 from processes.jack_recorder import Capture
 from processes.sound_cards import DeskCard, JackServer, jack_server
 from processes.typed_page import ERA
@@ -377,6 +378,18 @@ def test_files_of_another_measurement_are_not_gone_on_with(make: Make) -> None:
             file.write_text(file.read_text("utf-8").replace(old, new), "utf-8")
         assert bench.measure("--resume", *more) == 2
         assert re.search(cause, bench.said)
+
+
+def test_place_that_cannot_be_written_is_not_counted(make: Make) -> None:
+    """On a full disk one error says what is in the file, which keeps the first place only."""
+    bench = make(output="measured.csv")
+    bench.measure(keys=[""])
+    before = Path(bench.output).read_bytes()
+    with full_disk(at=16):
+        assert bench.measure("--resume", keys=["", ""]) == 2
+    last = bench.said.splitlines()[-1]
+    assert "measured.csv: cannot be written: File too large; 1 of 3 places are measured" in last
+    assert Path(bench.output).read_bytes() == before
 
 
 def test_place_is_repeated_or_skipped(make: Make) -> None:

@@ -177,6 +177,8 @@ def contrast_map(
         (4, 6)
     """
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    if isinstance(drive_modes, str):
+        raise InputError(f"drive_modes must be a list such as ['phased'], got {drive_modes!r}")
     expect_instance(drive_modes, Sequence, what="drive_modes", made_by="['switched', 'phased']")
     expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
     if grid is not None:

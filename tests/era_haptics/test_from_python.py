@@ -287,6 +287,12 @@ def test_query_is_the_answer_to_fingers_that_must_feel_one(
     assert heavy.layers != same.layers
 
 
+def test_contrast_map_refuses_one_drive_mode_as_text(table: era.LocalizationTable) -> None:
+    """Text is a sequence of letters, so its letters would be taken for drive modes."""
+    with pytest.raises(era.InputError, match=r"must be a list such as \['phased'\], got 'phased'"):
+        era.contrast_map(table, QUIET, drive_modes="phased")
+
+
 def test_results_become_frames(table: era.LocalizationTable) -> None:
     """A row a finger of an answer, a mode, a point of a map, a moment of a playback."""
     fingers = [era.Finger(at, era.Stimulus()) for at in (TARGET, BOTH[0])]

@@ -247,7 +247,7 @@ def parse_pair(text: str, *, what: str) -> tuple[int, int]:
 def parse_frequencies(text: str) -> "FloatArray":
     """Parse `LO:HI:STEP`, both ends included, or a list `60,110,250`, to frequencies (f,) [Hz].
 
-    Raises InputError for other text, and for a repeated frequency.
+    Raises InputError for other text, and for a list that does not ascend.
     """
     import numpy as np  # which other commands do without
 
@@ -259,10 +259,13 @@ def parse_frequencies(text: str) -> "FloatArray":
                 raise ValueError
             return np.asarray(low + step * np.arange(count))
         values = np.array([float(part) for part in text.split(",")])
+        if not (len(values) <= MAX_FREQUENCIES and np.isfinite(values).all() and min(values) > 0):
+            raise ValueError
     except (ValueError, OverflowError, ZeroDivisionError):
         raise InputError(
             f"--frequencies must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
-            f"60:320:10, and at most {MAX_FREQUENCIES} frequencies, got {text!r}"
+            f"60:320:10, or a list above zero, such as 60,110, and at most "
+            f"{MAX_FREQUENCIES} frequencies, got {text[:40]!r}"
         ) from None
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < len(values):
@@ -270,4 +273,6 @@ def parse_frequencies(text: str) -> "FloatArray":
             f"--frequencies must be distinct, got {distinct[counts.argmax()]:g} Hz twice in "
             f"{text[:40]!r}"
         )
+    if (np.diff(values) < 0).any():
+        raise InputError(f"--frequencies must ascend, got {text[:40]!r}; sort them")
     return values

@@ -116,6 +116,7 @@ def design(
     counts = _counts(eras) if eras else None
     distance = _quantity(apart, LENGTH, "--apart")
     springs = [_quantity(text, STIFFNESS, "--stiffness") for text in _listed(stiffness)]
+    is_new_folder = not output.exists()
     output.mkdir(parents=True, exist_ok=True)
     unfinished = UnfinishedDesign()
     try:
@@ -139,6 +140,10 @@ def design(
                 progress=progress,
                 on_layout=unfinished.add,
             )
+    except InputError:
+        if is_new_folder:
+            output.rmdir()
+        raise
     except KeyboardInterrupt:
         _report_unfinished(unfinished, rig_file, output, as_json=as_json)
         raise
@@ -179,8 +184,8 @@ def _report_unfinished(
 
 def _counts(text: str) -> Sequence[int]:
     """Parse N or LO-HI as a range of ERA counts."""
-    low, _, high = text.partition("-")
-    ends = [end.strip() for end in (low, high or low)]
+    low, dash, high = text.partition("-")
+    ends = [low.strip(), high.strip() if dash else low.strip()]
     if not all(end.isdecimal() for end in ends):
         raise InputError(f"--eras must be a number, or LO-HI such as 3-6, got {text!r}")
     first, last = map(int, ends)

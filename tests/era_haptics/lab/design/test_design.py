@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from era_haptics.command import run_era
 from era_haptics.lab.design import problem as problem_module
 from era_haptics.lab.design.design_run import assess, rank_layouts
 from era_haptics.lab.design.layout_keys import layout_keys
@@ -118,6 +120,21 @@ LOUD = replace(RIG, uncertainty=GAINS, eras=tuple(replace(era, stroke=0.01) for 
 """Weights of any kind reach the level, so that it does not matter."""
 PAIRS = tuple(replace(anywhere(PLATE), quiet=(1, 1)).sets(4, seed=4))
 OF_PAIRS = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), PAIRS)
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [(["--eras", "3-"], "--eras must be"), (["--keep", "SW,XX"], "keep must be")],
+)
+def test_refused_design_leaves_no_folder(
+    options: list[str], cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A range without its end, and an unknown ERA, are refused before anything is written."""
+    folder = tmp_path / "out"
+    words = ["design", str(example_rig_path()), "-o", str(folder), "--where", "nosuch.yaml"]
+    assert run_era([*words, *options]) == 2
+    assert cause in capsys.readouterr().err
+    assert not folder.exists()
 
 
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:

@@ -307,16 +307,19 @@ class _Space:
         """Return the complex eigenvalue [rad²/s²] of a mode near a real one, and its deflection
         (m,).
 
-        Also its eigenvalue at the frequencies of the band, for the same shape, (k,).
+        Also its eigenvalue at the frequencies of the band, for the same shape, (k,). Raises
+        InputError if the iteration does not converge.
         """
         value = complex(eigenvalue)
         start = self._starts[:, number].astype(complex)
         mode = start
+        is_converged = False
         for _ in range(_STEPS):
             A, B = self._matrices(self._band.within(value.real))
             last_value = value
             value = (mode @ A @ mode) / (mode @ B @ mode)
-            if abs(value - last_value) <= 1e-10 * (abs(value) + 1.0):
+            is_converged = abs(value - last_value) <= 1e-10 * (abs(value) + 1.0)
+            if is_converged:
                 break
             mode = np.linalg.solve(A - value * (1 + 1e-12) * B, B @ mode)
             mode /= np.linalg.norm(mode)
@@ -326,6 +329,13 @@ class _Space:
             nearest = int(np.argmax(np.abs(start @ self._mass @ modes)))
             value = complex(values[nearest])
             mode = modes[:, nearest]
+        elif not is_converged:
+            frequency = math.sqrt(max(eigenvalue, 0.0)) / (2 * math.pi)
+            raise InputError(
+                f"plate: its mode near {frequency:.4g} Hz must converge in {_STEPS} steps, got "
+                f"{abs(value - last_value):.2g} rad²/s² in the last one; check the loss factors of "
+                "its layers"
+            )
         mode = mode / np.sqrt(mode @ B @ mode)
         values_in_band = list[complex]()
         for frequency, (A, B) in zip(self._band.frequencies, self._at_nodes, strict=True):
@@ -486,7 +496,7 @@ def unresolved_at(
     wave = p - _CURVATURE
     excess = 1 + np.cos(2 * wave * np.arccos(cosine)) / (wave * sine)
     missing = excess / resolved**2
-    wavelengths2 = np.maximum(_COS2 * missing[:, :1], _SIN2 * missing[:, 1:])
+    inverse_wavenumbers2 = np.maximum(_COS2 * missing[:, :1], _SIN2 * missing[:, 1:])
     # Of waves along the edge x = 0, whose distance is along x.
     to_edge = np.maximum(np.minimum(points, sides - points), 0)
     q = 2 * to_edge * resolved[:, ::-1]
@@ -496,14 +506,14 @@ def unresolved_at(
     at_corner = edge.prod(axis=1) / F_less_1**2
     bending = 1 + edge.sum(axis=1) + (_CORNER - 1 - 2 * F_less_1) * at_corner
     softness = D / plate.rigidity_towards(_COS2)  # 1 for isotropic materials
-    mean_bending = (wavelengths2 * softness).mean(axis=1)
-    logarithm = np.log(np.maximum(1, wavelengths2 / plate.thickness**2)).mean(axis=1) / 2
+    mean_bending = (inverse_wavenumbers2 * softness).mean(axis=1)
+    logarithm = np.log(np.maximum(1, inverse_wavenumbers2 / plate.thickness**2)).mean(axis=1) / 2
     images = (1 + edge / F_less_1).prod(axis=1)
     return UnresolvedCompliance(
         footprints=places,
         bending=bending * mean_bending / (4 * np.pi * D),
         shear=images * logarithm / (2 * np.pi * plate.shear_rigidity),
-        wavenumber=wavelengths2.mean(axis=1) ** -0.5,
+        wavenumber=inverse_wavenumbers2.mean(axis=1) ** -0.5,
         decade=images * math.log(10) / (2 * np.pi * plate.shear_rigidity),
     )
 

@@ -270,6 +270,14 @@ def test_complex_modes_equal_a_complex_eigenproblem():
         assert loss == pytest.approx(exact.imag, rel=1e-2)
 
 
+def test_a_complex_mode_that_does_not_converge_is_refused(monkeypatch):
+    """In two steps the mode of a lossy core is still on its way."""
+    monkeypatch.setattr("model.spectral.modes._STEPS", 2)
+    plate = panel((PANEL[0], replace(PANEL[1], loss_factor=1.0), PANEL[2]))
+    with pytest.raises(InputError, match=r"^plate: its mode near .* must converge in 2 steps"):
+        solve_free_plate(plate, SpectralMesh(10, 8, 0.375, 0.225), frequency_max=300.0)
+
+
 def test_lossy_layers_damp_in_time_as_at_each_frequency():
     """On soft mounts a mode decays with half its loss factor, that of the free plate's mode."""
     layers = (PANEL[0], replace(PANEL[1], loss_factor=0.3), PANEL[2])

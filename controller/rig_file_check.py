@@ -35,7 +35,7 @@ from model.rig.rig_warnings import (
 )
 from model.rig.sections import LimitsSection
 from model.structure.attachments import support_problem
-from model.structure.surface import centre_of_surface
+from model.structure.surface import center_of_surface
 from model.study.promise_cost import clock_cost, uncertainty_cost
 from model.transients.excursions import excursion_notes
 
@@ -113,7 +113,7 @@ def _rig_warnings(rig: Rig, balance: RigBalance | None, link_warnings: list[str]
 def _balance(rig: Rig) -> RigBalance | None:
     """Return how the plate rests on its supports; None for a surface that its modes hold."""
     surface = rig.plate.surface
-    if surface is not None and centre_of_surface(surface) is None:
+    if surface is not None and center_of_surface(surface) is None:
         return None
     return RigBalance(rig)
 

@@ -31,7 +31,7 @@ from model.structure.attachments import (
     footprints_of,
     mean_over,
 )
-from model.structure.modal_elasticity import Discretisation
+from model.structure.modal_elasticity import Discretization
 from model.structure.plate import SHEAR_CORRECTION, Plate
 
 DOF_PER_NODE = 3
@@ -159,7 +159,7 @@ MIN_NODES_PER_WAVELENGTH = 6
 
 
 @dataclass(frozen=True)
-class Mesh(Discretisation):
+class Mesh(Discretization):
     """nx by ny equal rectangles over length by width [m], optionally with strips along the edges.
 
     strip [m]: width of one more row of elements along every edge, for the boundary layer of a free
@@ -471,7 +471,7 @@ def lowest_modes(
     if count >= size / 2:
         lowest = (0, count - 1)
         return linalg.eigh(stiffness.toarray(), mass.toarray(), subset_by_index=lowest)
-    factor = factorise(stiffness + shift * mass)
+    factor = factorize(stiffness + shift * mass)
     eigenvalues, vectors = eigsh(
         stiffness,
         count,
@@ -485,7 +485,7 @@ def lowest_modes(
     return eigenvalues[order], vectors[:, order]
 
 
-def factorise(matrix: sparse.sparray) -> SuperLU:
+def factorize(matrix: sparse.sparray) -> SuperLU:
     """Factorize a matrix with symmetric pattern and a strong diagonal.
 
     SuperLU's defaults, meant for unsymmetric matrices, take several times longer here; a pivot

@@ -17,10 +17,10 @@ from model.ensemble.kernel_plates import touch
 from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate
 from model.table.table import FingertipShapes, LocalizationTable, read_fingertips
 
-CENTRE_AND_RIM = np.array([0, *range(9, 21)])
+CENTER_AND_RIM = np.array([0, *range(9, 21)])
 """Indices of fine points of a fingertip between which no null can hide."""
 
-CENTRE_AND_FOUR = np.array([0, 9, 12, 15, 18])
+CENTER_AND_FOUR = np.array([0, 9, 12, 15, 18])
 """Indices of a few fine points of a fingertip."""
 
 MAX_FINGERS_BY_POINT = 4
@@ -225,7 +225,7 @@ class FingerForms:
         return replace(forms, few=few, fine=contacts.fine_fields[:, others])
 
     def by_point(
-        self, forms: Forms, others: Sequence[int], points: IntArray = CENTRE_AND_RIM
+        self, forms: Forms, others: Sequence[int], points: IntArray = CENTER_AND_RIM
     ) -> Forms:
         """Return forms in which each point of every other finger counts separately.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from model import drive_modes
 from model.answer.fingers_on_plate import (
-    CENTRE_AND_RIM,
+    CENTER_AND_RIM,
     MAX_FINGERS_BY_POINT,
     MAX_VARIANCE_FINE,
 )
@@ -245,7 +245,7 @@ def _packed_rules(table: LocalizationTable) -> Rules:
         missing=MISSING,
         max_by_point=MAX_FINGERS_BY_POINT,
         pruning_step=PRUNING_STEP,
-        rim_count=len(CENTRE_AND_RIM),
+        rim_count=len(CENTER_AND_RIM),
         is_deep=gain_variance < MAX_VARIANCE_FINE,
         others=uncertainty.changes_modes,
         gain_variance=gain_variance,
@@ -265,7 +265,7 @@ def _packed_rules(table: LocalizationTable) -> Rules:
         sets=len(table.threshold_sets),
     )
     rules.point(
-        rim=CENTRE_AND_RIM,
+        rim=CENTER_AND_RIM,
         group=np.array(groups, dtype=np.int32) if groups else None,
         threshold=table.thresholds,
         error=table.error_power,

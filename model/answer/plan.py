@@ -158,9 +158,9 @@ def query(
 
 def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> None:
     """Compute in advance the data for the first answer of a table in a drive mode."""
-    centre = (table.plate.length / 2, table.plate.width / 2)
+    center = (table.plate.length / 2, table.plate.width / 2)
     for quiet in ((), ((0.0, 0.0),)):
-        placed = Placement((centre,), quiet)
+        placed = Placement((center,), quiet)
         query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
 
 

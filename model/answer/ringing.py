@@ -152,8 +152,8 @@ class RingingUnderFingers:
         tips = read_fingertips(table, self.places)
         finger_count, point_count, coordinate_count = tips.fine.shape
         loads = fingertip_loads(table.fingertip, self.places, self.loads)
-        centres = tips.fine[: len(loads), 0].astype(float)
-        fingers = [(centre, load.fingertip) for centre, load in zip(centres, loads, strict=True)]
+        centers = tips.fine[: len(loads), 0].astype(float)
+        fingers = [(center, load.fingertip) for center, load in zip(centers, loads, strict=True)]
         squares = np.zeros(())
         for frequency, bases in tones:
             accelerations = enveloped_accelerations(

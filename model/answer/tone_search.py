@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.answer.fingers_on_plate import (
-    CENTRE_AND_FOUR,
+    CENTER_AND_FOUR,
     MAX_FINGERS_BY_POINT,
     DriveTones,
     FingerForms,
@@ -337,7 +337,7 @@ def _switched_candidates(
     finger_forms = fingers.forms(all_rows, with_fine=is_by_point)
     steady = finger_forms.of(stream.targets, quiet, stream.level_db_sl, contents.background)
     if is_by_point:
-        steady = finger_forms.by_point(steady, quiet, CENTRE_AND_FOUR)
+        steady = finger_forms.by_point(steady, quiet, CENTER_AND_FOUR)
     forms = _forms_at(rows, steady, ringing if quiet else None)
     groups = _groups(fingers.table)
     candidates = list[_Candidate]()

@@ -52,7 +52,7 @@ from model.fem import (
     Mesh,
     PlateMatrices,
     assemble,
-    factorise,
+    factorize,
     lowest_modes,
 )
 from model.reduction.point_cache import PointCache
@@ -130,7 +130,7 @@ class FiniteElementModes:
 
     def __init__(self, plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float) -> None:
         self._matrices = matrices = assemble(plate, mesh)
-        self._factor = factorise(matrices.stiffness + shift * matrices.mass)
+        self._factor = factorize(matrices.stiffness + shift * matrices.mass)
         cut = (2 * math.pi * cutoff_frequency) ** 2
         count = plate.modes_below(cutoff_frequency) + RIGID_BODY_MODES + 4
         while True:

@@ -60,7 +60,7 @@ from model.spectral.polynomials import (
     follow,
 )
 from model.structure.attachments import as_footprints, mean_over
-from model.structure.modal_elasticity import Discretisation
+from model.structure.modal_elasticity import Discretization
 from model.structure.plate import (
     LaminateLayer,
     Plate,
@@ -582,7 +582,7 @@ _POINTS_PER_DEGREE = 8  # of the raster that shows a field: fifty to a wavelengt
 
 
 @dataclass(frozen=True)
-class SpectralMesh(Discretisation):
+class SpectralMesh(Discretization):
     """Legendre polynomials up to degrees nx along x and ny along y, over length by width [m]."""
 
     element_name: ClassVar[str] = POLYNOMIALS
@@ -675,7 +675,7 @@ class SpectralMesh(Discretisation):
 
 
 @dataclass(frozen=True)
-class KnownModes(Discretisation):
+class KnownModes(Discretization):
     """In place of a mesh: nx modes of a surface up to a frequency [Hz], in one row."""
 
     frequency: float

@@ -37,7 +37,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError, expect_values
 from model.structure.plate import Plate
-from model.structure.surface import centre_of_surface, moments_of_surface
+from model.structure.surface import center_of_surface, moments_of_surface
 from registry.limits import HAND_LOAD, MAX_FINGER_LOAD
 
 Gain: TypeAlias = tuple[float, float, float]
@@ -682,20 +682,20 @@ def static_loads(
     At least three springs are not in one line. K q = sum of weights p, reactions k p' q.
     """
     p, stiffness, mass = _attached(plate, eras, loads)
-    x, y = centre_of_mass(plate)
+    x, y = center_of_mass(plate)
     plate_moments = plate.mass * np.array([1.0, x / plate.length - 0.5, y / plate.width - 0.5])
     weight = GRAVITY * (p @ mass + plate_moments)
     q = np.linalg.solve((p * stiffness) @ p.T, weight)
     return np.asarray((stiffness * (q @ p))[stiffness > 0])
 
 
-def centre_of_mass(plate: Plate) -> Point:
+def center_of_mass(plate: Plate) -> Point:
     """Return the center of mass of the bare plate [m]: its center, or a surface's, from its
     modes."""
     if plate.surface is not None:
-        centre = centre_of_surface(plate.surface)
-        if centre is not None:
-            return centre
+        center = center_of_surface(plate.surface)
+        if center is not None:
+            return center
     return plate.length / 2, plate.width / 2
 
 

@@ -16,7 +16,7 @@ from model.structure.attachments import (
     GRAVITY,
     PointLoad,
     Source,
-    centre_of_mass,
+    center_of_mass,
     static_loads,
 )
 from model.structure.plate import Plate
@@ -86,7 +86,7 @@ def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoa
     attached = [*(source.support for source in sources), *loads]
     springs = [support for support in attached if support.stiffness > 0]
     masses = np.array([plate.mass, *(load.mass for load in attached)])
-    positions = np.array([centre_of_mass(plate), *((load.x, load.y) for load in attached)])
+    positions = np.array([center_of_mass(plate), *((load.x, load.y) for load in attached)])
     x, y = (masses @ positions / masses.sum()).tolist()
     return Balance(
         weight=GRAVITY * float(masses.sum()),

@@ -6,7 +6,7 @@ lowest elastic modes (`Plate.mode_deviations`), and a power law of its loss fact
 Shapes and higher modes follow theory. Adhesives and air change the complex eigenvalues of modes
 with frequency: their dispersion.
 
-`Discretisation` is the common base of finite-element and polynomial meshes: the shortest waves that
+`Discretization` is the common base of finite-element and polynomial meshes: the shortest waves that
 they resolve.
 """
 
@@ -185,7 +185,7 @@ def _powers(plate: Plate, omega: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Discretisation(ABC):
+class Discretization(ABC):
     """nx by ny elements, or polynomials of degrees nx and ny, over length by width [m]."""
 
     nx: int

@@ -535,10 +535,10 @@ def shear_corrections(layers: Sequence[LaminateLayer]) -> FloatArray:
     of layers without slip. Exact in soft layers between stiff ones, where shear matters most.
     """
     factors = np.empty(len(layers))
-    E, nu, thickness, centres = _columns(layers)
+    E, nu, thickness, centers = _columns(layers)
     plane = E / (1 - nu**2)
-    neutral = plane * thickness @ centres / (plane @ thickness)
-    bottoms = centres - thickness / 2 - neutral
+    neutral = plane * thickness @ centers / (plane @ thickness)
+    bottoms = centers - thickness / 2 - neutral
     stress = 0.0  # tau at the bottom of the layer; tau' = -E (z - neutral)
     t, weights = np.polynomial.legendre.leggauss(4)
     for number, (E, h, bottom) in enumerate(zip(plane, thickness, bottoms, strict=True)):

@@ -140,7 +140,7 @@ def digest_of_file(path: Path) -> str:
     return hashlib.sha256(read_measured_bytes(path)).hexdigest()
 
 
-def centre_of_surface(surface: Surface) -> Point | None:
+def center_of_surface(surface: Surface) -> Point | None:
     """Return the center of mass [m] of a surface; None unless its rigid body is free to tilt."""
     moments = moments_of_surface(surface)
     if moments is None:

@@ -90,9 +90,9 @@ def map_contrast(
     quiet_contacts = tuple(quiet)
     grid = grid or table.grid
     modes = tuple(map(checked_mode, drive_modes)) or (table.drive_mode,)
-    centres = grid.centres(table.plate)
+    centers = grid.centres(table.plate)
     questions: list[tuple[int, int, Placement]] = []
-    for cell, (x, y) in enumerate(centres.tolist()):
+    for cell, (x, y) in enumerate(centers.tolist()):
         nearest = min(math.dist((x, y), contact) for contact in quiet_contacts)
         if nearest < FINGERTIP_RADIUS or not table.plate.contains(x, y):
             continue
@@ -107,8 +107,8 @@ def map_contrast(
         progress(done, len(questions))
     fields = contrasts.reshape(len(modes), 2, grid.ny, grid.nx)
     return ContrastMap(
-        x=centres[: grid.nx, 0],
-        y=centres[:: grid.nx, 1],
+        x=centers[: grid.nx, 0],
+        y=centers[:: grid.nx, 1],
         quiet=quiet_contacts,
         promised_db={mode: fields[row, 0] for row, mode in enumerate(modes)},
         nominal_db={mode: fields[row, 1] for row, mode in enumerate(modes)},

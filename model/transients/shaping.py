@@ -234,8 +234,8 @@ class Shaper:
         self._full_share = lru_cache(_KEPT)(self._magnet_share)
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
-        self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
-        self._shapes = plate.shapes_at(self._centres)
+        self._centers = _SURROUNDINGS.centres(plate.reduced.plate)
+        self._shapes = plate.shapes_at(self._centers)
         # Readings of the last fingers: contents that begin together have each other's.
         self._fingers: dict[Point, tuple[FloatArray, FloatArray]] = {}
         self._felt = lru_cache(_KEPT)(self._read)
@@ -338,7 +338,7 @@ class Shaper:
         if quiet:
             quiet_rows = self._resting(quiet)
         else:  # the plate beyond 50 mm of all targets, or all of a small plate
-            background = self._shapes[is_background(self._centres, targets)]
+            background = self._shapes[is_background(self._centers, targets)]
             quiet_rows = background / math.sqrt(len(background))
         return responses_at(self.prepare(frequency), means, quiet_rows, is_alone=not quiet)
 

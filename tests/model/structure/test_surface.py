@@ -31,7 +31,7 @@ from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
 from model.structure.attachments import (
     GRAVITY,
-    centre_of_mass,
+    center_of_mass,
     rigid_body_frequencies,
     static_loads,
 )
@@ -163,7 +163,7 @@ def test_surface_has_the_centre_of_mass_of_its_modes(
     middle = np.array([PAPER.plate.length, PAPER.plate.width]) / 2
     expected = (PAPER.plate.mass * middle + mass * modes["nodes"][node, :2]) / whole
     assert rig.plate.mass == pytest.approx(whole, rel=1e-3)
-    assert centre_of_mass(rig.plate) == pytest.approx(expected, abs=1e-5)
+    assert center_of_mass(rig.plate) == pytest.approx(expected, abs=1e-5)
     assert GRAVITY * whole == pytest.approx(static_loads(rig.plate, rig.eras).sum(), rel=1e-3)
     moments = static_loads(rig.plate, rig.eras) @ [(era.x, era.y) for era in rig.eras]
     assert moments / (GRAVITY * whole) == pytest.approx(expected, rel=1e-3)
@@ -181,7 +181,7 @@ def test_surface_has_the_centre_of_mass_of_its_modes(
     rocking = rigid_body_frequencies(rig.plate, rig.eras)
     assert rocking == pytest.approx(np.sqrt(squares) / (2 * np.pi), rel=1e-3)
     plain = load_rig(_write(tmp_path, modes))
-    assert centre_of_mass(plain.plate) == pytest.approx(middle, abs=1e-5)
+    assert center_of_mass(plain.plate) == pytest.approx(middle, abs=1e-5)
 
 
 def test_few_modes_are_off_as_much_as_stated(

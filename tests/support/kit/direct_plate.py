@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem import Mesh, PlateMatrices, assemble, factorise
+from model.fem import Mesh, PlateMatrices, assemble, factorize
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
@@ -56,7 +56,7 @@ def direct_acceleration(
             + touch.T @ sparse.diags_array(attached) @ touch
         )
         load = touch[: len(eras)].T @ sparse.diags_array([_force(era, omega) for era in eras])
-        displacement = factorise(dynamic_stiffness).solve(load.toarray())
+        displacement = factorize(dynamic_stiffness).solve(load.toarray())
         result[row] = -(omega**2) * (observe @ displacement).T
     return result
 

@@ -76,6 +76,9 @@ _LOSSES = (0.1, 0.3, 3.0, 10.0, 30.0)
 _BOLTS = (0.01, 0.02, 0.04, 0.08, 0.16)  # of the plate's mass
 _MAX_LOSS_FACTOR = 0.9
 _BEYOND_RANGE = 1.5  # factor on the ends of a range
+# Natural frequencies of another plate, relative to those of the solved plate, from which on its
+# solution is scaled. The modes it has kept then reach well beyond the tones.
+_MIN_SCALED_FREQUENCY = 0.85
 FITTED_HYPOTHESES = 5  # hypotheses for which the rest of the rig is fitted
 REFINED_HYPOTHESES = 2  # best hypotheses whose value is refined
 _REFINEMENTS = 7  # values
@@ -502,15 +505,23 @@ def _variations(rig: Rig) -> list[_Variation]:
 
 
 def _solved(match: Match, variation: _Variation, factor: float) -> SensedPlate | None:
-    """Return the plate of a match with another value, None if the value is impossible."""
+    """Return the plate of a match with another value, None if the value is impossible.
+
+    The free plate is solved again for another size, and for a plate too soft for the kept modes.
+    """
     try:
         rig = variation.applied(match.plate.rig, factor)
     except InputError:
         return None
-    if not variation.is_size:
+    solved_frequency = match.plate.free.plate.lowest_bending_frequency
+    is_soft = rig.plate.lowest_bending_frequency < _MIN_SCALED_FREQUENCY * solved_frequency
+    if not variation.is_size and not is_soft:
         return match.plate.with_rig(rig)
-    # A sensor that would be off the plate is moved to its edge.
     measurement = match.fit.measurement
+    highest = float(measurement.frequencies.max())
+    if highest > rig.mesh.highest_frequency(rig.plate):
+        rig = replace(rig, mesh=rig.mesh.resolving(rig.plate, highest))
+    # A sensor that would be off the plate is moved to its edge.
     points = np.clip(measurement.points, 0, [rig.plate.length, rig.plate.width])
     return sensed_plate(rig, measurement.moved(points).sensors, measurement.frequencies)
 

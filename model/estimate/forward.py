@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.errors import InputError
 from model.finger import Grid
 from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
 from model.reduction.reduced_plate import AttachmentPoints, Modes, ReducedModes, places_of
@@ -810,8 +811,11 @@ def _quotient(numerator: AnyArray, denominator: ComplexArray) -> ComplexArray:
 def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
     """Change of the receptance (f, s, n) [m/N] between sensors and ERAs if losses are viscous.
 
-    For a plate with form errors, at parameters x (p,).
+    At parameters x (p,). Raises InputError for a plate without form errors: its supported modes
+    need the residual vectors of its attachments.
     """
+    if model.form is None:
+        raise InputError("form must be ReducedModes for viscous losses, got None")
     plate = model.at(x)
     omega = model.omega[:, None, None]
     change = 1j * plate.eta[:, None, None] * (omega * _viscous(plate) - _lossy(plate))

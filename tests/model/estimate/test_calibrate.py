@@ -27,6 +27,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
+from model.estimate.forward import viscous_difference
 from model.estimate.measurement import sensors_at
 from model.estimate.sensed_plate import SensedPlate, sensed_plate
 from model.rig.rig import Rig
@@ -314,6 +315,12 @@ SENSED_PLATE_POINTS = np.random.default_rng(0).uniform(0.01, 0.2, (30, 2))
 def solved() -> SensedPlate:
     """Solved as the rig has it."""
     return sensed_plate(SENSED_PLATE_RIG, sensors_at(SENSED_PLATE_POINTS), SENSED_PLATE_FREQUENCIES)
+
+
+def test_viscous_losses_of_a_plate_without_form_errors_are_refused(solved: SensedPlate) -> None:
+    """They are not zero, but its modes without residual vectors cannot state them."""
+    with pytest.raises(InputError, match=r"^form must be"):
+        viscous_difference(solved, np.zeros(solved.space.size))
 
 
 FORM_ERRORS_FREQUENCIES = np.arange(50.0, 491.0, 40.0)

@@ -402,7 +402,9 @@ class Hypothesis:
     @property
     def era(self) -> str:
         """Name of the ERA if the value belongs to a single ERA, otherwise ""."""
-        return self.key[len("eras.") :].rpartition(".")[0]
+        if not self.key.startswith("eras."):
+            return ""
+        return self.key.removeprefix("eras.").rpartition(".")[0]
 
     @property
     def explains(self) -> bool:

@@ -121,16 +121,16 @@ def of_plate(rig: Rig, **values: float) -> Rig:
     return replace(rig, plate=replace(rig.plate, **values))
 
 
-def of_thickness(rig: Rig, by: float) -> Rig:
-    """A plate of another thickness, on a mesh that resolves the tones on a thinner one."""
-    rig = of_plate(rig, thickness=by * rig.plate.thickness)
+def resolving(rig: Rig) -> Rig:
+    """The plate on a mesh that resolves the tones, its own if that is fine enough."""
     if PAPER_TONES[-1] <= rig.mesh.highest_frequency(rig.plate):
         return rig
     return replace(rig, mesh=rig.mesh.resolving(rig.plate, PAPER_TONES[-1]))
 
 
 ANOTHER: dict[str, Callable[[Rig, Any], Rig]] = {
-    "thickness": of_thickness,
+    "thickness": lambda rig, by: resolving(of_plate(rig, thickness=by * rig.plate.thickness)),
+    "modulus": lambda rig, by: resolving(replace(rig, plate=rig.plate.scaled(modulus=by))),
     "length": larger,
     "width": lambda rig, by: larger(rig, 1.0, by),
     "loss": lambda rig, by: of_plate(rig, loss_factor=by * rig.plate.loss_factor),

@@ -106,7 +106,8 @@ class Identification:
     fitted: RigFit
     """The most likely parameters."""
     covariance: FloatArray
-    """Covariance (p, p) of the parameters, widened by the disagreement of held-out paths."""
+    """Covariance (p, p) of the parameters, widened by the disagreement of held-out paths, for
+    their standard errors."""
     held_out: HeldOutPaths | None
     """Prediction of held-out paths, None if there are too few."""
 
@@ -173,8 +174,11 @@ class Identification:
 
         unexplained: fraction of the fields that the model does not explain. Fingers and harmonics
         keep their uncertainty. common_gain, which no fit narrows, is added to the error of the mean
-        gain.
+        gain. The disagreement of held-out paths is left out: `unexplained` states the same error.
         """
+        if self.held_out is not None:
+            fit_alone = replace(self, covariance=self.fitted.stated_covariance, held_out=None)
+            return fit_alone.uncertainty(unexplained)
         space = self.fitted.space
         original = self.fitted.model.rig.uncertainty
         mean_gain = _rows(space, "gain").mean(axis=0, keepdims=True)

@@ -213,6 +213,8 @@ def test_uneven_plate_is_promised_less(rig: Rig, found: Identification) -> None:
         for uncertainty in (linear, replace(linear, field=0.0))
     )
     assert promised < too_much - 1
+    # The disagreement of held-out paths is stated once, as an error of fields.
+    assert uneven.uncertainty(known.field) == known
     assert fit_rows(uneven)[3:]
     assert not fit_rows(found)[3:]
 

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import FloatArray, Point, nullable
-from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, Grid
 from model.structure.attachments import PointLoad
 from model.structure.exciter import Actuator
@@ -62,7 +61,8 @@ _REFLECTIONS: tuple[Reflection, ...] = ((False, False), (True, False), (False, T
 class WeakCells:
     """Promised felt contrast from each cell of a plate to other fingers.
 
-    -inf where the level is not reached, NaN on a plate too small for two fingers.
+    -inf where the level is not reached; NaN off the plate, and on a plate too small for two
+    fingers.
     """
 
     grid: Grid
@@ -152,34 +152,41 @@ def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
     """Return questions for each cell of `map_grid` as the target, with one other finger each.
 
     Positions of the other finger are drawn for each cell, at least MIN_DISTANCE away. They are the
-    same for cells that mirror each other if the plate is symmetric.
+    same for cells that mirror each other if the plate is symmetric. A cell whose center is not on
+    the plate has no questions.
     """
     grid, plate = map_grid(table), table.plate
     images = mirror_images(table)
     is_symmetric_along_x = (True, False) in images
     is_symmetric_along_y = (False, True) in images
-    questions = []
-    for number, centre in enumerate(grid.centres(plate)):
+    questions: list[list[Placement]] = []
+    centers = grid.centres(plate)
+    is_on_plate = plate.covers(centers)
+    for number, center in enumerate(centers):
+        if not is_on_plate[number]:
+            questions.append([])
+            continue
         row, column = divmod(number, grid.nx)
         if is_symmetric_along_x:
             column = min(column, grid.nx - 1 - column)
         if is_symmetric_along_y:
             row = min(row, grid.ny - 1 - row)
         others = _positions_over(plate, seed=[column, row])
-        is_far = np.linalg.norm(others - centre, axis=1) >= MIN_DISTANCE
-        target = (float(centre[0]), float(centre[1]))
+        is_far = np.linalg.norm(others - center, axis=1) >= MIN_DISTANCE
+        target = (float(center[0]), float(center[1]))
         questions.append([Placement((target,), ((x, y),)) for x, y in others[is_far].tolist()])
     return questions
 
 
 def _positions_over(plate: Plate, *, seed: list[int]) -> FloatArray:
-    """Draw random positions (n, 2) [m] all over a plate, with all their mirror images."""
+    """Draw random positions (n, 2) [m] all over a plate, with all their mirror images on it."""
     columns, rows = (np.arange(count) for count in STRATA)
     strata = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
     offsets = np.random.default_rng(seed).uniform(0, 1, strata.shape)
     relative = (strata + offsets) / (2 * np.array(STRATA))
     mirrored = np.abs(relative - [[0, 0], [1, 0], [0, 1], [1, 1]])
-    return np.asarray(np.array([plate.length, plate.width]) * mirrored.reshape(-1, 2))
+    positions = np.asarray(np.array([plate.length, plate.width]) * mirrored.reshape(-1, 2))
+    return positions[plate.covers(positions)]
 
 
 def ask_once(table: LocalizationTable) -> Ask:
@@ -206,11 +213,11 @@ def contrasts_of(
     level_db_sl: float = WANTED_LEVEL_DB_SL,
     drive_mode: str | None = None,
 ) -> Contrasts | None:
-    """Return the promised and nominal felt contrast [dB], None if the level is not reached."""
-    try:
-        answer = query(table, placed, level_db_sl, drive_mode=drive_mode)
-    except InputError:
-        return None
+    """Return the promised and nominal felt contrast [dB], None if the level is not reached.
+
+    Raises the errors of `query`.
+    """
+    answer = query(table, placed, level_db_sl, drive_mode=drive_mode)
     target = answer.fingers[0]
     promised, nominal = target.promised_contrast_db, target.contrast_db
     if promised is None or nominal is None or not answer.is_reached:
@@ -221,8 +228,11 @@ def contrasts_of(
 def mirror_images(table: LocalizationTable) -> list[Reflection]:
     """Return the reflections, along x, y or both, under which a table's plate is the same.
 
-    The reflection along neither is always included.
+    The reflection along neither is always included. It is the only one for a surface, whose modes
+    can be asymmetric.
     """
+    if table.plate.surface is not None:
+        return [_REFLECTIONS[0]]
     as_it_is = _attachments(table, _REFLECTIONS[0])
     return [
         reflection for reflection in _REFLECTIONS if _attachments(table, reflection) == as_it_is

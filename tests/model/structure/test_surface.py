@@ -38,6 +38,7 @@ from model.structure.attachments import (
 from model.structure.surface import is_within, rings_of
 from model.study.exact_plates import amplitudes_on, draw_plates
 from model.study.verification import verify_table
+from model.study.weak_cells import map_grid, mirror_images, pair_questions
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, load_table, save_table
 from sim.plant.imperfections import draw_of_ensemble
@@ -346,6 +347,11 @@ def test_cut_out_has_no_fingers(
     assert ([each.key.id for each in change.down], change.rejected) == ([2], ("off_plate",))
     table = build_table(rig)
     assert len(table.cell_centres) < table.grid.cell_count
+    cells, questions = map_grid(table).centres(rig.plate), pair_questions(table)
+    assert [bool(each) for each in questions] == rig.plate.covers(cells).tolist()
+    asked = [placed.contacts for of_cell in questions for placed in of_cell]
+    assert rig.plate.covers(np.vstack(asked)).all()
+    assert mirror_images(table) == [(False, False)]
     candidates = area_of("anywhere", rig.plate).candidates(0.02)  # for ERAs
     assert rig.plate.covers(np.vstack([table.cell_centres, candidates])).all()
     monkeypatch.setattr(layout_check, "MAX_REGION_TOUCHES", 6)

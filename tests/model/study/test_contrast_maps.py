@@ -35,7 +35,14 @@ from model.study import table_export
 from model.study.overview import find_overview, summarize
 from model.study.promise_cost import PromiseCost, clock_cost, tolerance_costs
 from model.study.table_export import export_csv, export_mat
-from model.study.weak_cells import WeakCells, find_weak_cells, map_grid, pair_questions, text_map
+from model.study.weak_cells import (
+    WeakCells,
+    contrasts_of,
+    find_weak_cells,
+    map_grid,
+    pair_questions,
+    text_map,
+)
 from model.table.table_file import build_table
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
@@ -315,6 +322,13 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
         np.testing.assert_allclose(
             sorted(size[0] - mirrored[:, 0]), sorted(x for x, _ in others), atol=1e-12
         )
+
+
+def test_wrong_questions_are_errors_and_not_silent_cells(table):
+    """A mistyped drive mode, and a finger off the plate."""
+    for target, mode in (((0.1, 0.1), "swiched"), ((0.9, 0.1), None)):
+        with pytest.raises(InputError):
+            contrasts_of(table, Placement((target,), ((0.2, 0.2),)), drive_mode=mode)
 
 
 def test_weak_and_feasible_follow_from_twelve_decibels(table):

@@ -19,16 +19,27 @@ def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
 def with_error(value: float, error: float, unit: str = "", *, sign: str = "") -> str:
     """Format a value with its standard error to two digits: `74.02 ± 0.87 GPa`.
 
+    See `error_parts`.
+    """
+    shown_value, shown_error, shown_unit = error_parts(value, error, unit, sign=sign)
+    return f"{shown_value} ± {shown_error} {shown_unit}".strip()
+
+
+def error_parts(
+    value: float, error: float, unit: str = "", *, sign: str = ""
+) -> tuple[str, str, str]:
+    """Format a value, its standard error to two digits, and their unit.
+
     Units: see `in_display_unit`; sign: "+" also shows the sign of values above zero.
     """
     factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
     value *= factor
     error *= factor
     if not (math.isfinite(error) and error > 0):
-        return f"{value:{sign}.5g} ± {error:.2g} {shown_unit}".strip()
+        return f"{value:{sign}.5g}", f"{error:.2g}", shown_unit
     _, _, exponent = f"{error:.1e}".partition("e")
     decimals = max(0, 1 - int(exponent))
-    return f"{value:{sign}.{decimals}f} ± {error:.{decimals}f} {shown_unit}".strip()
+    return f"{value:{sign}.{decimals}f}", f"{error:.{decimals}f}", shown_unit
 
 
 def percent(share: float) -> str:

@@ -18,7 +18,7 @@ from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification
 from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.sensed_plate import Parameter
 from model.estimate.space import MAX_GUESSED, UNIT_KEYS
-from model.quantities import counted, in_display_unit, percent, with_error
+from model.quantities import counted, error_parts, in_display_unit, percent, with_error
 from model.rig.rig import Rig, Uncertainty
 from model.structure.exciter import Actuator
 from model.study.expected_contrast import ExpectedContrast
@@ -85,9 +85,9 @@ def _parameter_row(parameter: Parameter, confused: str) -> _Row:
     value_before = in_display_unit(parameter.before, parameter.unit, digits=5)
     if parameter.standard_error is None:
         return parameter.name, "", "", value_before, "not identified"
-    text = with_error(parameter.value, parameter.standard_error, parameter.unit)
-    value, _, error = text.partition(" ± ")
-    _, space, unit = error.partition(" ")
+    value, error, unit = error_parts(parameter.value, parameter.standard_error, parameter.unit)
+    fitted = f"{value} {unit}".strip()
+    standard_error = f"± {error} {unit}".strip()
     notes = []
     if parameter.before:
         notes.append(f"{100 * (parameter.value / parameter.before - 1):+.1f} %")
@@ -95,7 +95,7 @@ def _parameter_row(parameter: Parameter, confused: str) -> _Row:
         notes.append("at its bound")
     if confused:
         notes.append(f"correlated with {confused}")
-    return parameter.name, value + space + unit, f"± {error}", value_before, ", ".join(notes)
+    return parameter.name, fitted, standard_error, value_before, ", ".join(notes)
 
 
 def _millimetres(point: Point) -> str:
@@ -334,8 +334,7 @@ def _difference_row(parameter: Parameter, standard_error: float, confused: dict[
     unit = parameter.unit
     if unit not in ("", "°"):
         unit = f" {unit}"
-    text = with_error(parameter.value, standard_error, sign="+")
-    value, _, error = text.partition(" ± ")
+    value, error, _ = error_parts(parameter.value, standard_error, sign="+")
     prior = f"± {float(f'{parameter.prior:.2g}'):g}{unit}"
     note = confused[parameter.name]
     if note:

@@ -104,7 +104,8 @@ class Scorer:
     """Score layouts on a rig's plate, solved once, with given contact sets.
 
     frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each set, those with contents first;
-    eras: ERAs of every layout in order, at any positions; additional ones equal the last.
+    eras: ERAs of every layout in order: kept ones at their positions, then one at any position;
+    additional ones equal it.
     """
 
     def __init__(
@@ -119,6 +120,7 @@ class Scorer:
         plate = rig.plate
         omega = 2 * np.pi * frequencies
         self._rig = rig
+        self._eras = tuple(eras)
         self._frequencies = frequencies
         self._contents = contents
         self._thicknesses = _thicknesses_of(rig.uncertainty)
@@ -146,9 +148,12 @@ class Scorer:
         return np.moveaxis(by_tip[:, :, tips, :, tips], 0, 2)
 
     def places(self, at: FloatArray) -> PlaceReceptances:
-        """Solve for ERAs at positions [m] (c, 2)."""
-        foot = self._rig.eras[0].foot
-        return self._solved(np.column_stack([at, np.full(len(at), foot)]))
+        """Solve for ERAs at positions [m] (c, 2): kept ones at their own, else the last."""
+        *fixed_eras, last = self._eras
+        feet = np.full(len(at), last.foot)
+        for era in fixed_eras:
+            feet[(at == [era.x, era.y]).all(axis=1)] = era.foot
+        return self._solved(np.column_stack([at, feet]))
 
     def _solved(self, footprints: FloatArray) -> PlaceReceptances:
         loads = self._rig.masses
@@ -333,9 +338,9 @@ class Scorer:
         """Return scores (f, s) of weights (f, s, n), minus the penalty for missing level."""
         stroke = np.maximum(np.abs(w).max(axis=-1), _SMALLEST)
         level = np.abs(np.vecdot(c, w)) / stroke
-        missing = 20 * np.log10(np.maximum(level, _SMALLEST) / self._required[rows])
+        surplus = 20 * np.log10(np.maximum(level, _SMALLEST) / self._required[rows])
         decibels = 10 * np.log10(np.maximum(score, _SMALLEST))
-        return np.asarray(decibels + LEVEL_PENALTY * np.minimum(missing, 0))
+        return np.asarray(decibels + LEVEL_PENALTY * np.minimum(surplus, 0))
 
 
 def _thicknesses_of(uncertainty: Uncertainty) -> FloatArray:

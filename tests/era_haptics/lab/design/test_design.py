@@ -164,7 +164,8 @@ def dense_score(
     """Mean score [dB] by the definition: one dense system for each set, frequency and finger.
 
     With errors of the gains and of the thickness only, whose plates are solved anew, and one quiet
-    finger; the best weights are an eigenvector. ERAs at places (n, 2) [m] are like the first.
+    finger; the best weights are an eigenvector. ERAs at places (n, 2) [m], or (n, 3) with
+    their feet, are like the first.
     """
     plate, std = rig.plate, rig.uncertainty.frequency
     plates = [
@@ -175,7 +176,7 @@ def dense_score(
         )
         for h in ((1, 1 + std, 1 - std) if std else (1,))
     ]
-    eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y) in enumerate(places)]
+    eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y, *_) in enumerate(places)]
     omega = 2 * np.pi * frequencies
     z, force = attached_stiffness(omega, eras), drive_forces(omega, eras)
     tip = rig.fingertip.dynamic_stiffness(omega)
@@ -220,7 +221,7 @@ def _field(
     attached: dynamic stiffness of the ERAs (n,) and of the finger, force of the ERAs (n,).
     """
     z, tip, force = attached
-    at = np.vstack([places, finger])
+    at = np.vstack([places, np.resize([*finger, 0.0], places.shape[1])])
     between, to = free.receptances(at, points, np.array([frequency]))
     applied = np.vstack([np.diag(force), np.zeros(len(places))])
     forces = np.linalg.solve(np.eye(len(at)) + np.diag([*z, tip]) @ between[0], applied)
@@ -251,6 +252,20 @@ def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) ->
     assert len(dense) >= 20
     numbers = np.flatnonzero((candidates[:, None] == best.positions).all(axis=-1).any(axis=1))
     assert dense[tuple(numbers.tolist())] == pytest.approx(max(dense.values()), abs=0.05)
+
+
+def test_each_era_is_scored_with_its_own_foot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kept ERA on a point and new ones on discs of 6 cm, against a dense solve of them."""
+    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
+    first, *others = LOUD.eras
+    rig = replace(LOUD, eras=(first, *(replace(era, foot=0.06) for era in others)))
+    search = LayoutSearch(problem(rig=rig, count=3, kept=(first.name,), contacts=OF_PAIRS))
+    places = np.array([[first.x, first.y], [0.25, 0.05], [0.1, 0.2]])
+    footprints = np.column_stack([places, [0.0, 0.06, 0.06]])
+    ends = np.array([rig.limits.frequency_min, rig.limits.frequency_max])
+    (scored,) = search.scored([places])
+    expected = dense_score(rig, footprints, PAIRS, ends)
+    assert scored.score_db == pytest.approx(expected, abs=0.05)
 
 
 def problem(**changes) -> DesignProblem:

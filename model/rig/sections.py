@@ -32,6 +32,7 @@ from model.config.units import (
     TIME,
     Dimension,
 )
+from model.errors import InputError
 from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.actuator_keys import ActuatorOfAnyKind
 from model.rig.key_types import (
@@ -68,6 +69,13 @@ from registry.limits import GuardLimits
 Edges = Literal["edges"]
 Points = Annotated[int, Field(ge=3, le=40)]
 TissueStiffness = Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)]
+
+
+def _given(value: float | None, key: str) -> float:
+    """Return the value of a required key; raises InputError without it."""
+    if value is None:
+        raise InputError(f"{key}: missing; add it")
+    return value
 
 
 class MassSection(Section):
@@ -110,8 +118,9 @@ class MassSection(Section):
         """Build the mass on a plate, or the masses of a frame along its edges."""
         if self.at is not None:
             x, y = place_on(plate, self.at)
-            return (PointLoad(x, y, mass=self.mass or 0.0, foot=self.foot),)
-        per_length = self.mass_per_length or 0.0
+            mass = _given(self.mass, "mass")
+            return (PointLoad(x, y, mass=mass, foot=self.foot),)
+        per_length = _given(self.mass_per_length, "mass_per_length")
         return tuple(
             PointLoad(x, y, mass=per_length * length, foot=EDGE_FOOT)
             for x, y, length in edge_points(plate, self.points)
@@ -143,7 +152,7 @@ class SupportSection(Section):
     """
 
     damping: SpringDamping | None = None
-    """Viscous damping, instead of a loss factor or in addition to a given one."""
+    """Viscous damping (along edges, in total), instead of a loss factor or in addition to it."""
 
     foot: Foot = 0.0
     """Radius of its contact disc, 0 for a point; required if the stiffness is 1 MN/m or more."""
@@ -154,7 +163,7 @@ class SupportSection(Section):
     stiffness_per_length: (
         Annotated[float, Quantity(LINE_STIFFNESS, above=0, at_most=1e9)] | None
     ) = None
-    """Stiffness per length of a support along the edges.
+    """Stiffness per length along the edges.
 
     Default: required with `along`
     """
@@ -170,11 +179,12 @@ class SupportSection(Section):
         spring = PointLoad(0.0, 0.0, damping=damping, loss_factor=loss_factor)
         if self.at is not None:
             x, y = place_on(plate, self.at)
-            stiffness = self.stiffness or FEET[self.kind or "foam"]
+            of_kind = None if self.kind is None else FEET[self.kind]
+            stiffness = _given(self.stiffness or of_kind, "stiffness")
             foot = replace(spring, x=x, y=y, stiffness=stiffness, foot=self.foot, is_foot=True)
             return (foot,)
         edge = 2 * (plate.length + plate.width)
-        per_length = self.stiffness_per_length or 0.0
+        per_length = _given(self.stiffness_per_length, "stiffness_per_length")
         return tuple(
             replace(
                 spring,

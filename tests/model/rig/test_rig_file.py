@@ -36,6 +36,7 @@ from model.rig.rig_writing import (
     save_fitted,
     save_rig,
 )
+from model.rig.sections import MassSection, SupportSection
 from model.structure.attachments import Fingertip, PointLoad
 from model.table.table_file import build_table
 
@@ -526,6 +527,23 @@ def test_check_says_which_motion_by_an_output_is_a_guess() -> None:
     far = "[[40, 2, 179], [150, 2, -176], [255, 2, 94], [300, 2, 90], [320, 2, 0]]"
     _, coarse = gain_notes(parse_rig("rig.yaml", text(gains=far)))
     assert coarse.startswith("eras.SE.gains: phases differ by 90 degrees between 150 and 255 Hz")
+
+
+@pytest.mark.parametrize(
+    ("section", "key"),
+    [
+        (MassSection(at=[0.1, 0.1]), "mass"),
+        (MassSection(along="edges"), "mass_per_length"),
+        (SupportSection(at=[0.1, 0.1]), "stiffness"),
+        (SupportSection(along="edges"), "stiffness_per_length"),
+    ],
+)
+def test_section_without_a_required_key_is_not_built(
+    section: MassSection | SupportSection, key: str
+) -> None:
+    """No mass and no stiffness is assumed where a file was not checked."""
+    with pytest.raises(InputError, match=f"^{key}: missing"):
+        section.build(parse_rig("rig.yaml", text()).plate)
 
 
 def test_era_without_amplifier_supports_as_one_at_rest() -> None:

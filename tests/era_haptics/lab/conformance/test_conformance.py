@@ -218,7 +218,7 @@ class _PlaysOn(SimulatedAmplifier):
 
     def _silence(self, moment: float, *, ramp: float) -> None:
         if self.state != "OPERATION_ENABLED":
-            super().silence(moment, ramp=ramp)
+            super()._silence(moment, ramp=ramp)
 
 
 def test_nothing_is_run_after_one_that_is_not_silenced() -> None:

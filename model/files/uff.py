@@ -54,6 +54,8 @@ _FIELDS = {
 _IEEE_754 = b"2"  # floating-point format of a binary dataset 58
 _SI = 1  # units code of dataset 164
 _NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimeters, centimeters, inches
+# Coordinate systems that are global, by dataset: mesh programs give the global one the number 1.
+_GLOBAL_SYSTEMS = {15: (0,), 2411: (0, 1)}
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
 _BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
 _HEADER = re.compile(
@@ -470,7 +472,8 @@ def read_nodes(
                 f"three coordinates, got {len(numbers)} numbers; export it again"
             )
         nodes[int(numbers[0])] = tuple(numbers[4:])
-        if numbers[2]:
+        displacement_system = int(numbers[2])
+        if displacement_system not in _GLOBAL_SYSTEMS[block.kind]:
             turned.add(int(numbers[0]))
 
 

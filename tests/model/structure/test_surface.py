@@ -78,7 +78,7 @@ def _universal(modes: Mapping[str, FloatArray], *, kind: int, length: float) -> 
     rows += [f"{0.0:25.16E}", "    -1", "    -1", "  2411"]
     for number, node in enumerate(modes["nodes"], start=1):
         at = "".join(f"{length * each:25.16E}" for each in node)
-        rows += [f"{number:10d}{0:10d}{0:10d}{1:10d}", at]
+        rows += [f"{number:10d}{1:10d}{1:10d}{11:10d}", at]  # as mesh programs number systems
     rows.append("    -1")
     types = "".join(f"{each:10d}" for each in (1, 2, 2, 8, 2, 3))
     for frequency, shape in zip(modes["frequencies"], modes["shapes"], strict=True):

@@ -244,14 +244,9 @@ class Group:
             self._limit.reschedule(threads.now())
 
     async def _exchange(self, exchange: Callable[[], Awaitable[_T]]) -> _T:
-        """Run an exchange of the control loop; react to an error, then raise it.
-
-        The control loop makes only one exchange at a time; stops and disarms can come meanwhile.
-        """
+        """Run an exchange of the control loop; react to an error, then raise it."""
         if not self.is_armed:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
-        if self._limit is not None:
-            raise RuntimeError("an exchange must end before the next one begins")
         epoch = self.members.epoch
         limit = asyncio.timeout(None)
         try:

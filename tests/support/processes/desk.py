@@ -33,7 +33,7 @@ from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from processes.jack_recorder import Capture
-from processes.sound_cards import soft_amp_program
+from processes.sound_cards import JACK_PRIORITY, soft_amp_program
 
 ERA = Path(sys.executable).with_name("era")
 _ROOT = Path(__file__).parents[3]
@@ -115,8 +115,7 @@ def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     rig = (EXAMPLES / "rig.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(rig.replace("/tmp/plate", str(link)), "utf-8")
     shutil.copy(EXAMPLES / "sensors.csv", folder)
-    priority = ["-R", "-P10"] if os.geteuid() == 0 else ["-r"]
-    server = ["jackd", "-n", name, "-S", *priority]
+    server = ["jackd", "-n", name, "-S", *JACK_PRIORITY]
     server += ["-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     with contextlib.ExitStack() as stack:
@@ -253,9 +252,8 @@ def playing(desk: Desk, *, level_db_sl: float) -> Iterator[Client]:
         f"rig: calibrated.yaml\ntable: table.npz\nsocket: era.sock\nlevel_db_sl: {level_db_sl}\n"
     )
     (desk.folder / "daemon.yaml").write_text(config, "utf-8")
-    amplifier: list[object] = [*soft_amp_program(is_watched=False)]
-    amplifier += ["--device", DEVICE, "--channels", 4]
-    amplifier += ["--link", desk.folder / "amp", "--until-eof"]
+    options = ["--device", DEVICE, "--channels", 4, "--link", desk.folder / "amp", "--until-eof"]
+    amplifier = [*soft_amp_program(is_watched=False), *options]
     daemon = [ERA, "daemon", "daemon.yaml"]
     with contextlib.ExitStack() as stack:
         log = stack.enter_context((desk.folder / "touches.log").open("w"))

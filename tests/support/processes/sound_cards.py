@@ -43,6 +43,8 @@ RATE = 48_000
 BLOCK = 256
 START = 20.0  # s
 HOST = str(Path(__file__).with_name("steady_host.py"))
+JACK_PRIORITY = ("-R", "-P10") if os.geteuid() == 0 else ("-r",)
+"""Options of jackd: real-time priority, which root may have, else the ordinary one."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,11 @@ def jack_server(
     monitored is not, as servers of sound cards are not.
     """
     environment = os.environ | {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1"}
-    priority = ["-R", "-P10"] if os.geteuid() == 0 else ["-r"]
     dummy = ["-d", "dummy", "-p", str(BLOCK), "-r", str(rate)]
     dummy += ["-C", str(inputs), "-P", str(outputs)]
     waiting, monitors = ([], ["-m"]) if is_monitored else (["-S"], [])
     with subprocess.Popen(
-        ["jackd", "-n", name, *waiting, *priority, *dummy, *monitors],
+        ["jackd", "-n", name, *waiting, *JACK_PRIORITY, *dummy, *monitors],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=environment,

@@ -42,7 +42,7 @@ from model.config.document import ConfigError as ConfigError
 from model.errors import InputError as InputError
 from model.estimate.calibration_result import Calibration as Calibration
 from model.finger import Grid as Grid
-from model.reduction.reduced_plate import SupportedModes as SupportedModes
+from model.reduction.supported_plate import SupportedModes as SupportedModes
 from model.rig.rig import Rig as Rig
 from model.rig.rig import Uncertainty as Uncertainty
 from model.rig.rig_file import example_rig_path as example_rig_path

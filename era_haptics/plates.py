@@ -30,12 +30,8 @@ from model.answer.stimulus import Placement, Stimulus, check_on_plate, together
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError, expect_instance, expect_number, is_whole, shown
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.reduced_plate import (
-    ReducedPlate,
-    SupportedModes,
-    reduce_free_plate,
-    supported_modes,
-)
+from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
+from model.reduction.supported_plate import SupportedModes, supported_modes
 from model.rig.rig import Rig
 from model.structure.attachments import check_loads, footprints_of
 from model.study.contrast_maps import ContrastMap

@@ -132,7 +132,7 @@ def record_responses(
     """Measure the steady response of a simulated plate to each ERA at each frequency [Hz].
 
     The simulation runs in the time domain; structural damping is the viscous equivalent of
-    `model.reduction.reduced_plate`.
+    `model.reduction.supported_plate`.
     """
     reduced = reduce_plate(
         rig.plate,

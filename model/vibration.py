@@ -28,7 +28,8 @@ from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted
 from model.reduction.free_plate import FiniteElementModes, FreePlate, solve_free_plate
-from model.reduction.reduced_plate import on_springs, reduce_free_plate
+from model.reduction.reduced_plate import reduce_free_plate
+from model.reduction.supported_plate import on_springs
 from model.rig.rig import Rig
 from model.rig.rig_mesh import mesh_of
 from model.spectral.modes import PlateMesh, SpectralMesh
@@ -265,7 +266,7 @@ def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalM
     """Solve all modes of the undamped plate with attachments; the highest ones are mixtures."""
     places = footprints_of(attached)
     reduced = reduce_free_plate(free, places)
-    _, (M, _, K) = on_springs(reduced, [each.in_time for each in attached], reduced.at(places))
+    M, _, K = on_springs(reduced, [each.in_time for each in attached], reduced.at(places))
     squares, coordinates = linalg.eigh(K, M)
     frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
     return NaturalModes(frequencies, reduced.at, coordinates[: len(reduced.omega)], free.mesh)

@@ -44,8 +44,9 @@ from scipy import linalg
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.finger import Grid
+from model.reduction.attachment_points import AttachmentPoints, Modes, places_of
+from model.reduction.form_modes import ReducedModes
 from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
-from model.reduction.reduced_plate import AttachmentPoints, Modes, ReducedModes, places_of
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import (
     attached_stiffness,

@@ -13,8 +13,8 @@ from model.estimate.forward import MASS_CELLS, ForwardModel, PlateValues, Sensor
 from model.estimate.measurement import Measurement
 from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.space import MAX_GUESSED, VALUE_UNITS, rig_with, space_from_datasheets
+from model.reduction.form_modes import reduced_modes
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduced_modes
 from model.rig.actuator_keys import ACTUATOR_KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of

@@ -156,21 +156,21 @@ class FiniteElementModes:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
         return self._matrices.deflection_at(points) @ self._vectors
 
-    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and others (m, 2)."""
+    def truncated_terms(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
+        """Sums between points (n, 2) and receivers (m, 2)."""
         residuals = self._residuals(points)
-        other_residuals = self._residuals(others)
-        forces = np.array([self._matrices.mass @ term.T for term in other_residuals])
-        terms = np.empty((2 * RESIDUAL_ORDER, residuals.shape[1], other_residuals.shape[1]))
-        terms[0] = self._matrices.deflection_at(points) @ other_residuals[0].T
+        receiver_residuals = self._residuals(receivers)
+        forces = np.array([self._matrices.mass @ term.T for term in receiver_residuals])
+        terms = np.empty((2 * RESIDUAL_ORDER, residuals.shape[1], receiver_residuals.shape[1]))
+        terms[0] = self._matrices.deflection_at(points) @ receiver_residuals[0].T
         for power in range(2, 2 * RESIDUAL_ORDER + 1):
             terms[power - 1] = residuals[power // 2 - 1] @ forces[(power + 1) // 2 - 1]
         return terms
 
-    def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
+    def basis(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
+        """Deflection at receivers of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
         (unknowns,) = self.unknowns(points)
-        return self._matrices.deflection_at(others) @ unknowns
+        return self._matrices.deflection_at(receivers) @ unknowns
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` in degrees of freedom, in one part."""
@@ -267,21 +267,21 @@ class SpectralModes:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
         return self._observe(points).shapes
 
-    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and others (m, 2)."""
+    def truncated_terms(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
+        """Sums between points (n, 2) and receivers (m, 2)."""
         shapes = self._observe(points)
-        other_shapes = self._observe(others)
-        terms = (shapes.truncated * self._powers[:, None]) @ other_shapes.truncated.T
-        terms[0] += self._local(shapes, other_shapes)
+        receiver_shapes = self._observe(receivers)
+        terms = (shapes.truncated * self._powers[:, None]) @ receiver_shapes.truncated.T
+        terms[0] += self._local(shapes, receiver_shapes)
         return np.asarray(terms)
 
-    def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
+    def basis(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
+        """Deflection at receivers of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
         shapes = self._observe(points)
-        other_shapes = self._observe(others)
-        residuals = self._residuals(shapes) @ other_shapes.truncated.T
-        residuals[: len(shapes.shapes)] += self._local(shapes, other_shapes)
-        return np.hstack([other_shapes.shapes, residuals.T])
+        receiver_shapes = self._observe(receivers)
+        residuals = self._residuals(shapes) @ receiver_shapes.truncated.T
+        residuals[: len(shapes.shapes)] += self._local(shapes, receiver_shapes)
+        return np.hstack([receiver_shapes.shapes, residuals.T])
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` by symmetry class, without the local compliance."""
@@ -306,12 +306,14 @@ class SpectralModes:
         """Residual vectors in truncated modes, term by term, (RESIDUAL_ORDER n, t)."""
         return np.concatenate(at.truncated * self._powers[:RESIDUAL_ORDER, None])
 
-    def _local(self, own: _PointShapes, other: _PointShapes) -> FloatArray:
+    def _local(self, sources: _PointShapes, receivers: _PointShapes) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""
-        places = self._local_plate, own.unresolved, other.unresolved
-        missing = compliance_between(*places)
+        plate = self._local_plate
+        missing = compliance_between(plate, sources.unresolved, receivers.unresolved)
         if self._is_softer:
-            missing = missing + uncertain_compliance(*places)
+            missing = missing + uncertain_compliance(
+                plate, sources.unresolved, receivers.unresolved
+            )
         return missing / self.largest_truncated
 
     def _observe(self, points: FloatArray) -> _PointShapes:
@@ -344,31 +346,31 @@ FreeModes: TypeAlias = SpectralModes | FiniteElementModes | SurfaceModes
 A truncated mode with eigenvalue lambda is represented by u = 1 / (lambda + shift), in units of
 largest_truncated, u_c, the value of the lowest one [s²/rad²]. eigenvalues omega² (r,) [rad²/s²],
 and losses (r,), their imaginary part in addition to the plate's loss factor; dispersion: their
-change with frequency, None without any. Between points (n, 2) and others (m, 2), or footprints (n,
-3):
+change with frequency, None without any. Between points of forces (n, 2) and receivers (m, 2), or
+footprints (n, 3):
 
 - shapes_at(points): of the modes, (n, r);
-- truncated_terms(points, others): sums of phi phi' (u / u_c)^j over the truncated modes, j = 1, 2,
-  ..., (TERMS, n, m);
+- truncated_terms(points, receivers): sums of phi phi' (u / u_c)^j over the truncated modes, j = 1,
+  2, ..., (TERMS, n, m);
 - alternatives(), not of elements: modes of equally likely plates, which show the uncertainty of
   fields;
-- basis(points, others): deflection at others of modes and of the RESIDUAL_ORDER residual vectors of
-  forces at the points, term by term, (m, r + RESIDUAL_ORDER n); unknowns(points): its columns in
-  the unknowns of the plate, by symmetry class.
+- basis(points, receivers): deflection at receivers of modes and of the RESIDUAL_ORDER residual
+  vectors of forces at the points, term by term, (m, r + RESIDUAL_ORDER n); unknowns(points): its
+  columns in the unknowns of the plate, by symmetry class.
 """
 
 TERMS = 2 * RESIDUAL_ORDER
 """Truncated sums of a receptance between points."""
 
 
-def _between(modes: FreeModes, points: FloatArray, others: FloatArray) -> FloatArray:
-    """Products of shapes at points and others [m], then truncated sums, (r + TERMS, n, m).
+def _between(modes: FreeModes, points: FloatArray, receivers: FloatArray) -> FloatArray:
+    """Products of shapes at points and receivers [m], then truncated sums, (r + TERMS, n, m).
 
     Points (n, 2) or footprints (n, 3).
     """
-    shapes, other_shapes = modes.shapes_at(points), modes.shapes_at(others)
-    kept = shapes.T[:, :, None] * other_shapes.T[:, None]
-    return np.concatenate([kept, modes.truncated_terms(points, others)])
+    shapes, receiver_shapes = modes.shapes_at(points), modes.shapes_at(receivers)
+    kept = shapes.T[:, :, None] * receiver_shapes.T[:, None]
+    return np.concatenate([kept, modes.truncated_terms(points, receivers)])
 
 
 def combined(functions: ComplexArray, products: FloatArray) -> ComplexArray:
@@ -547,10 +549,10 @@ class FreePlate:
         """
         lowest_truncated = 1 / self.modes.largest_truncated - self.shift
         thinnest = np.min(thickness)
-        least = omega.max(initial=0.0) / math.sqrt(lowest_truncated)
-        if not thinnest > least:
+        limit = omega.max(initial=0.0) / math.sqrt(lowest_truncated)
+        if not thinnest > limit:
             raise InputError(
-                f"thickness must be above {least:.3g} times that of the solved plate at "
+                f"thickness must be above {limit:.3g} times that of the solved plate at "
                 f"{omega.max() / (2 * math.pi):g} Hz, got {thinnest:g}; solve that plate"
             )
 

@@ -10,7 +10,7 @@ without which a reduced plate (`model.reduction.reduced_plate`) could not repres
 with n modes per Hz and the frequency f up to which as many are expected, both of the straight line
 through the natural frequencies by their number, m their mean square at a point and k their
 wavenumber. A homogeneous plate with these modes has this compliance. Residual vectors that a
-program exports as modes are truncated modes like others.
+program exports as modes are truncated modes like any others.
 
 The estimate is a mean. The compliance of a given surface depends on its next modes: for Gaussian
 shapes its relative deviation is sqrt(2 / 3N) with N known modes, at each position and in each
@@ -96,10 +96,9 @@ class SurfaceModes:
         self.eigenvalues = eigenvalues[: self._kept]
         self.losses = np.zeros(self._kept)
         self.dispersion: Dispersion | None = None
-        u = 1 / (eigenvalues[self._kept :] + shift)
-        self.largest_truncated = float(u.max())
-        orders = np.arange(1, 2 * RESIDUAL_ORDER + 1)
-        self._powers = (u / u.max()) ** orders[:, None]
+        self._shift = shift
+        self.largest_truncated = float(1 / (eigenvalues[self._kept] + shift))
+        self._powers = self._powers_at(frequencies[self._kept :])
         self._spline = RBFInterpolator(
             *_interpolated_shapes(exported, surface, plate), kernel="cubic", degree=2
         )
@@ -112,7 +111,6 @@ class SurfaceModes:
         slope, start = np.polyfit(numbers, elastic[half:], 1)
         self._spacing = max(float(slope), 1e-6 * highest)
         self._above = max(start + self._spacing * len(elastic), highest)
-        self._shift = shift
         self._waves = np.empty((3, 0, 0))
         self._cache = PointCache[FloatArray](_MAX_CACHED)
 
@@ -120,9 +118,7 @@ class SurfaceModes:
         """Yield surfaces that can have the known modes, with as many further modes drawn."""
         count = self._upper.stop
         frequencies = self._above + self._spacing * (np.arange(count) + 0.5)
-        u = 1 / ((2 * math.pi * frequencies) ** 2 + self._shift) / self.largest_truncated
-        orders = np.arange(1, len(self._powers) + 1)
-        powers = u ** orders[:, None]
+        powers = self._powers_at(frequencies)
         k = self._wavenumber * np.sqrt(frequencies / self._above)
         for seed in range(_ALTERNATIVES):
             rng = np.random.default_rng(seed)
@@ -134,6 +130,12 @@ class SurfaceModes:
             alternative._cache = PointCache(_MAX_CACHED)
             yield alternative
 
+    def _powers_at(self, frequencies: FloatArray) -> FloatArray:
+        """u / u_c of modes at frequencies (n,) [Hz] to the powers 1, 2, ..., (TERMS, n)."""
+        u = 1 / ((2 * math.pi * frequencies) ** 2 + self._shift)
+        orders = np.arange(1, 2 * RESIDUAL_ORDER + 1)
+        return np.asarray((u / self.largest_truncated) ** orders[:, None])
+
     @property
     def _wavenumber(self) -> float:
         """Wavenumber [rad/m] of the first mode that is estimated, of a plate with this density."""
@@ -144,18 +146,18 @@ class SurfaceModes:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
         return self._observe(points)[:, : self._kept]
 
-    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and others (m, 2)."""
+    def truncated_terms(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
+        """Sums between points (n, 2) and receivers (m, 2)."""
         shapes = self._observe(points)[:, self._kept :]
-        other_shapes = self._observe(others)[:, self._kept :]
-        known = (shapes * self._powers[:, None]) @ other_shapes.T
-        return np.asarray(known + self._local(points, others))
+        receiver_shapes = self._observe(receivers)[:, self._kept :]
+        terms = (shapes * self._powers[:, None]) @ receiver_shapes.T
+        return np.asarray(terms + self._local(points, receivers))
 
-    def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
-        shapes = self._observe(others)
+    def basis(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
+        """Deflection at receivers of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
+        shapes = self._observe(receivers)
         residuals = self._residuals(points) @ shapes[:, self._kept :].T
-        residuals += self._local(points, others)[:RESIDUAL_ORDER].reshape(residuals.shape)
+        residuals += self._local(points, receivers)[:RESIDUAL_ORDER].reshape(residuals.shape)
         return np.hstack([shapes[:, : self._kept], residuals.T])
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
@@ -172,21 +174,21 @@ class SurfaceModes:
         truncated = self._observe(points)[:, self._kept :]
         return np.concatenate(truncated * self._powers[:RESIDUAL_ORDER, None])
 
-    def _local(self, points: FloatArray, others: FloatArray) -> FloatArray:
+    def _local(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
         """Estimated terms of modes that are not known, as `truncated_terms`, (TERMS, n, m)."""
         points = np.atleast_2d(points)
-        others = np.atleast_2d(others)
-        distances = np.linalg.norm(points[:, None, :2] - others[None, :, :2], axis=2)
-        if points.shape[1] == others.shape[1] == 3:  # a disc yields less than a point
-            radii = np.maximum(points[:, None, 2], others[None, :, 2])
+        receivers = np.atleast_2d(receivers)
+        distances = np.linalg.norm(points[:, None, :2] - receivers[None, :, :2], axis=2)
+        if points.shape[1] == receivers.shape[1] == 3:  # a disc yields less than a point
+            radii = np.maximum(points[:, None, 2], receivers[None, :, 2])
             distances = np.hypot(distances, _MEAN_DISTANCE * radii)
         r, by_order = _correlations()
         arguments = self._wavenumber * distances
         correlations = np.array([np.interp(arguments, r, c, right=0.0) for c in by_order])
-        u = 1 / ((2 * math.pi * self._above) ** 2 + self._shift) / self.largest_truncated
-        orders = np.arange(1, len(by_order) + 1)
-        powers = u ** orders[:, None, None]
-        sizes = np.outer(self._sizes(self._observe(points)), self._sizes(self._observe(others)))
+        powers = self._powers_at(np.array([self._above]))[:, :, None]
+        source_sizes = self._sizes(self._observe(points))
+        receiver_sizes = self._sizes(self._observe(receivers))
+        sizes = np.outer(source_sizes, receiver_sizes)
         return np.asarray(powers * (self._above / self._spacing) * sizes * correlations)
 
     def _sizes(self, shapes: FloatArray) -> FloatArray:
@@ -199,11 +201,11 @@ class SurfaceModes:
         shapes = self._cache.get(points)
         if shapes is None:
             check_footprints_on_plate(points, **self._sides)
-            known = np.asarray(mean_over(self._spline, points, **self._sides))
+            exported = np.asarray(mean_over(self._spline, points, **self._sides))
             phases = np.tensordot(points[:, :2], self._waves[:2], axes=1) + self._waves[2]
             waves = math.sqrt(2 / _WAVES) * np.cos(phases).sum(axis=1)
-            drawn = self._sizes(known)[:, None] * waves
-            shapes = np.hstack([known, drawn])
+            drawn = self._sizes(exported)[:, None] * waves
+            shapes = np.hstack([exported, drawn])
             self._cache.put(points, shapes)
         return shapes
 

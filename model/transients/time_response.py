@@ -4,7 +4,7 @@
 
 q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers on
 it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
-`model.reduction.reduced_plate`. For exciters y is the voltage, k_b and c are the forces by it and
+`model.reduction.supported_plate`. For exciters y is the voltage, k_b and c are the forces by it and
 by its rate that push plate and magnet apart, and q includes the displacements of their magnets. The
 first-order system is diagonalized once for each set of attachments. There are three kinds of
 drives, all without a step size, so that no error grows with time:
@@ -40,7 +40,8 @@ from scipy import fft
 
 from model.arrays import Complex64Array, ComplexArray, FloatArray
 from model.errors import InputError
-from model.reduction.reduced_plate import ReducedPlate, modal_matrices, stretches
+from model.reduction.reduced_plate import ReducedPlate
+from model.reduction.supported_plate import modal_matrices, stretches
 from model.structure.attachments import (
     Fingertip,
     FingertipLoad,

@@ -25,15 +25,13 @@ from model.estimate.space import space_of
 from model.fem import ELEMENTS, MITC4, Mesh, PlateMatrices, assemble
 from model.finger import Grid
 from model.reduction import free_plate
+from model.reduction.attachment_points import place_slopes
 from model.reduction.free_plate import (
     FreePlate,
     solve_free_plate,
 )
-from model.reduction.reduced_plate import (
-    modal_matrices,
-    place_slopes,
-    reduce_plate,
-)
+from model.reduction.reduced_plate import reduce_plate
+from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.modes import SpectralMesh

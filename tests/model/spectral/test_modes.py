@@ -25,7 +25,8 @@ from model.fem import (
     assemble,
 )
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate, supported_modes
+from model.reduction.reduced_plate import reduce_free_plate
+from model.reduction.supported_plate import supported_modes
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_mesh import mesh_of, parse_mesh
 from model.spectral.direct_solution import AtOneFrequency

@@ -20,7 +20,8 @@ from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate, supported_modes
+from model.reduction.reduced_plate import reduce_free_plate
+from model.reduction.supported_plate import supported_modes
 from model.rig.rig import Rig
 from model.rig.rig_writing import rig as rig_by_keys
 from model.structure.attachments import (

@@ -16,12 +16,8 @@ from cases import shortly
 from kit.plates import exciter_rig, make_paper_rig
 from model.answer.envelope import swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import (
-    modal_matrices,
-    reduce_free_plate,
-    reduce_plate,
-    supported_modes,
-)
+from model.reduction.reduced_plate import reduce_free_plate, reduce_plate
+from model.reduction.supported_plate import modal_matrices, supported_modes
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig

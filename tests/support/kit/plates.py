@@ -28,7 +28,8 @@ from model.drive_modes import Forms, WeightedTones
 from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid, detection_threshold
-from model.reduction.reduced_plate import modal_matrices, reduce_plate
+from model.reduction.reduced_plate import reduce_plate
+from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import (

@@ -31,7 +31,8 @@ from scipy.signal import cont2discrete
 from era_haptics.lab.measuring.sound_card import SoundCard
 from kit.desk_plate import DeskPlate
 from model.arrays import ComplexArray, Float32Array, FloatArray
-from model.reduction.reduced_plate import modal_matrices, reduce_plate
+from model.reduction.reduced_plate import reduce_plate
+from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Rig
 from model.rig.rig_summary import exciters_of
 from model.structure.attachments import footprints_of

@@ -1,1 +1,1 @@
-"""From touches to drive commands, of era-haptics: touch sources, contacts, control loop."""
+"""Controller of era-haptics: from touches to commands for amplifiers."""

@@ -1,1 +1,1 @@
-"""Amplifiers, of era-haptics: drive commands, the guard, the protocol, its codecs and backends."""
+"""Drivers of era-haptics: protocol, wires and command limits of amplifiers."""

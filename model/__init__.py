@@ -1,1 +1,1 @@
-"""The plate in physics, of era-haptics: elements, actuators, localization; no I/O but files."""
+"""Plate model of era-haptics: plate, actuators and localization; its only I/O is files."""

@@ -1,1 +1,1 @@
-"""Basics that the packages of era-haptics share, such as plug-ins and typing suggestions."""
+"""Shared basics of era-haptics: plug-ins, command line, files, threads, time and limits."""

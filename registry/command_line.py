@@ -1,6 +1,7 @@
-"""How commands run: one group for the commands of several modules, and an exit status per error.
+"""Command line: joins the commands of several modules, runs one, and turns errors into an exit
+status.
 
-`era_haptics.command` lists the modules of `era`, `controller.cli.__main__` those of the controller.
+`era_haptics.command` lists the modules with the commands of `era`.
 """
 
 import errno
@@ -54,11 +55,12 @@ SECTIONS = {
     ),
     "Amplifier": ("amp", "soft-amp"),
 }
-"""Commands in the order of help and reference; rarely used ones are last in each section."""
+"""Commands by section, in the order of help and reference; rarely used commands are last."""
 
+# Exit statuses
 BAD_INPUT = 2
 BUG = 70  # EX_SOFTWARE of sysexits.h
-INTERRUPTED = 130
+INTERRUPTED = 130  # as a shell reports SIGINT
 BROKEN_PIPE = 141  # as a shell reports SIGPIPE
 
 ExitStatus: TypeAlias = dict[type[BaseException], int]
@@ -68,9 +70,9 @@ class CommandModule(Protocol):
     """A module that provides commands."""
 
     app: typer.Typer
-    """Its commands appear under `era`; commands of a group join the group of that name."""
+    """Commands to add to `era`. Groups with the same name in several modules become one group."""
     EXIT_STATUS: ExitStatus
-    """Exit status for each class of error that its commands raise on purpose."""
+    """Exit status for each class of exception that its commands raise on purpose."""
 
 
 LoadModules: TypeAlias = Callable[[], Sequence[CommandModule]]
@@ -81,16 +83,17 @@ _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def main(load: LoadModules) -> int:
-    """Run the command line of the process; return the exit status.
+    """Run the command line of this process; return its exit status.
 
-    load: called once signals end the process.
+    load: called after the signal handlers are set.
     """
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
     # Pictures go to files; a notebook passes its own backend to child processes, such as `!era`.
     os.environ["MPLBACKEND"] = "agg"
     protect_streams()
-    # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
+    # End immediately while modules load: nothing is armed, and an import could swallow a
+    # KeyboardInterrupt.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))
     instruction = os.environ.get(COMPLETE)
@@ -100,14 +103,14 @@ def main(load: LoadModules) -> int:
 
 
 COMPLETE = "_ERA_COMPLETE"
-"""Variable that completion scripts of `era --install-completion` set to request words."""
+"""Environment variable with the request of a shell's completion script."""
 
 
 def _complete(instruction: str, load: LoadModules) -> int:
-    """Print words for the command line that is being typed in a shell; return the exit status."""
+    """Print completions of the command line being typed in a shell; return the exit status."""
     from typer.completion import shell_complete
 
-    group, _ = join_commands(load())  # also registers typer's shells
+    group, _ = join_commands(load())  # also registers the shells that typer supports
     return shell_complete(group, {}, "era", COMPLETE, instruction)
 
 
@@ -123,9 +126,9 @@ def run(
     *,
     on_loaded: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run one command line with the commands of some modules; return the exit status.
+    """Run a command line; return the exit status.
 
-    on_loaded: called once the modules are loaded.
+    on_loaded: called when the modules with the commands are loaded.
     """
     end = arguments.index("--") if "--" in arguments else len(arguments)
     options = [argument for argument in arguments[:end] if argument != "--debug"]
@@ -137,7 +140,7 @@ def run(
         status = _invoke(group, arguments)
         print(end="", flush=True)  # sys.stdout can be missing or closed
     except BrokenPipeError:
-        # Python would complain again when it flushes at exit.
+        # Otherwise Python would report the broken pipe again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except (KeyboardInterrupt, typer.Abort):
@@ -153,11 +156,11 @@ class _Commands(TyperGroup):
     """The commands of `era` by section; commands without a section come last."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names in the order of help and reference."""
+        """Return the names in the order of help and reference."""
         return [name for names in self.sections().values() for name in names]
 
     def sections(self) -> dict[str, list[str]]:
-        """Names by the title of their section."""
+        """Return the names of the commands by section title."""
         remaining = set(self.commands)
         sections = {}
         for title, names in SECTIONS.items():
@@ -167,14 +170,14 @@ class _Commands(TyperGroup):
         return sections
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find a command; for the name of an option, such as `era version`, suggest the option."""
+        """Find a command. For the name of an option, such as `era version`, suggest the option."""
         option = f"--{args[0]}"
         if any(option in parameter.opts for parameter in self.get_params(ctx)):
             ctx.fail(f"No such command {args[0]!r}. Did you mean {option}?")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a list of commands for each section."""
+        """Write the commands of each section with their summaries."""
         width = max(len(name) for name in self.commands)
         limit = formatter.width - width - 6
         for title, names in self.sections().items():
@@ -188,7 +191,7 @@ class _Commands(TyperGroup):
 
 
 def join_commands(modules: Iterable[CommandModule]) -> tuple[TyperGroup, ExitStatus]:
-    """Return one group with the commands of all modules, and the exit status by error class."""
+    """Return a group with the commands of all modules, and the exit status by exception class."""
     app = typer.Typer(cls=_Commands, no_args_is_help=True)
     app.callback()(_root)
     group = _group(app)
@@ -197,15 +200,15 @@ def join_commands(modules: Iterable[CommandModule]) -> tuple[TyperGroup, ExitSta
     for module in modules:
         statuses.update(module.EXIT_STATUS)
         for word, command in _group(module.app).commands.items():
-            present = group.commands.setdefault(word, command)
-            if isinstance(present, TyperGroup) and isinstance(command, TyperGroup):
-                present.commands.update(command.commands)
+            joined = group.commands.setdefault(word, command)
+            if isinstance(joined, TyperGroup) and isinstance(command, TyperGroup):
+                joined.commands.update(command.commands)
     return group, statuses
 
 
 @cache
 def _group(app: typer.Typer) -> TyperGroup:
-    """Return the commands of an application, without rich, which would double the time of help."""
+    """Return the commands of an application; no rich markup, which doubles the time of help."""
     app.rich_markup_mode = None
     return get_group(app)
 
@@ -231,7 +234,7 @@ def _root(
 
 
 def _invoke(group: TyperGroup, arguments: list[str]) -> int:
-    """Run a command; return its exit status, 0 by default."""
+    """Run a command; return its exit status, 0 unless it states one."""
     try:
         with group.make_context("era", arguments) as context:
             group.invoke(context)
@@ -241,7 +244,7 @@ def _invoke(group: TyperGroup, arguments: list[str]) -> int:
 
 
 def _report(error: Exception, statuses: ExitStatus) -> int:
-    """Print the error that ended the run; return the exit status."""
+    """Print the error that ended the command; return the exit status."""
     for kind in type(error).__mro__:
         if kind in statuses:
             _print_error(f"error: {error}")
@@ -272,14 +275,14 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
 
 
 _NO_OUTPUT = (errno.EBADF, errno.EIO)
-"""Errors of writing to a stream that is open for reading, or whose terminal has gone."""
+"""Errors when writing to a stream that is open for reading only, or to a closed terminal."""
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of writing, which have no file name."""
+"""Errors when writing to a full disk; these have no file name."""
 
 
 def _file_error(error: OSError) -> str:
-    """Describe a file error with its remedy."""
+    """Return the description of a file error, with its remedy."""
     path = Path(str(error.filename))
     match error.errno:
         case errno.ENOENT if not path.parent.is_dir():
@@ -299,7 +302,7 @@ def _file_error(error: OSError) -> str:
 
 
 def _report_usage(error: typer.TyperException) -> int:
-    """Print a usage error, or the help if there is no command."""
+    """Print a usage error, or the help if there is no command; return the exit status."""
     message = reworded(error.format_message())
     context = getattr(error, "ctx", None)
     if context is None:

@@ -1,46 +1,48 @@
-"""Limits of the number of fingers, and of commands, as given by rigs and enforced by amplifiers'
-guards."""
+"""Limits on the number and load of fingers, and on the commands for an amplifier."""
 
 import math
 from dataclasses import dataclass
 
 MAX_CONTACTS = 20
-"""Maximum number of fingers: two people with ten, or four with five; more are an arm or a spill."""
+"""Maximum number of contacts on a plate: both hands of two people. More are an arm or a spill."""
 
 MAX_FINGERS = 10
-"""Maximum number of fingers with effects unless a daemon file sets it: the fingers of one
-person."""
+"""Default for the maximum number of fingers with effects: both hands of a person."""
 
 MAX_CONTENTS = 6
 """Maximum number of simultaneous contents; with more, no plate has any contrast left."""
 
-
-@dataclass(frozen=True)
-class GuardLimits:
-    """Limits of one amplifier: mechanical frequency [Hz] and level (1 is full stroke).
-
-    slew [1/s]: highest rise of a level; power: sum of squared levels over all channels; on_time
-    [s]: longest vibration without a pause; duty: fraction of any ten seconds; rate [1/s]:
-    command sets per second, except silent ones. All of these are unlimited by default.
-    """
-
-    frequency_min: float
-    frequency_max: float
-    level: float
-    slew: float = math.inf
-    power: float = math.inf
-    on_time: float = math.inf
-    duty: float = 1.0
-    rate: float = math.inf
-
-
 MAX_FINGER_LOAD = 10.0
 """Maximum load of a finger, in fingertips; a larger load is a resting hand."""
 
-HAND_LOAD, MAX_HAND_LOAD = 12.0, 40.0
-"""Load of a resting hand of unknown size, in fingertips, and the maximum.
+HAND_LOAD = 12.0
+"""Load of a resting hand of unknown size, in fingertips.
 
-The load of the heel of a hand with part of its weight is between estimates from its force to the
-power of two thirds (7 fingertips for 10 N) and from its area (30 for 20 cm²).
-docs/concepts/people.md states sources and uncertainty.
+It lies between two estimates for the heel of a hand: 7 from its force (10 N, to the power of two
+thirds) and 30 from its area (20 cm²). Sources and uncertainty: docs/concepts/people.md.
 """
+
+MAX_HAND_LOAD = 40.0
+"""Maximum load of a resting hand, in fingertips."""
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """Limits on the commands for one amplifier."""
+
+    frequency_min: float
+    """Minimum frequency of the vibration [Hz]."""
+    frequency_max: float
+    """Maximum frequency of the vibration [Hz]."""
+    level: float
+    """Maximum level of a channel; 1 is the full amplitude."""
+    slew: float = math.inf
+    """Maximum rise of a channel's level [1/s]."""
+    power: float = math.inf
+    """Maximum sum of the squared levels of all channels."""
+    on_time: float = math.inf
+    """Maximum duration of a vibration without a pause [s]."""
+    duty: float = 1.0
+    """Maximum fraction of any ten seconds in which a channel vibrates."""
+    rate: float = math.inf
+    """Maximum number of command sets per second, not counting silent ones [1/s]."""

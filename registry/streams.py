@@ -1,7 +1,7 @@
-"""Standard streams: foreign text never controls a terminal, and closed streams do no harm.
+"""Standard streams that escape control characters, and that exist even if they are closed.
 
-Output can quote names in files, replies of amplifiers or words of other clients. Control characters
-in these could clear a terminal, rename its window or hide a line.
+Output can quote file names, replies of amplifiers and text from other clients. Control characters
+in quoted text could clear a terminal, rename its window or hide a line.
 """
 
 import io
@@ -11,35 +11,35 @@ import sys
 from pathlib import Path
 from typing import TextIO
 
-# Control characters but for line feed and tab, and marks that turn the direction of text.
+# Control characters except line feed and tab, and marks that change the direction of text.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 
 
 def printable(text: str) -> str:
-    """Escape control characters but for line feed and tab, as `\\x1b`."""
+    """Escape control characters except line feed and tab, for example as `\\x1b`."""
     return _CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 class PrintableStream(io.TextIOWrapper):
-    """A stream of text on which control characters are escaped."""
+    """Text stream that escapes control characters."""
 
     def write(self, text: str) -> int:
-        """Write text; return its length, as callers expect."""
+        """Write text; return the length of the original text."""
         super().write(printable(text))
         return len(text)
 
 
 def protect_streams() -> None:
-    """Escape control characters on standard output and error, and open streams that are closed.
+    """Escape control characters on standard output and error; open closed streams as /dev/null.
 
-    A closed stream reads and writes nothing, as /dev/null: a service or a program with windows may
-    start without them. Characters that an encoding lacks are escaped as well.
+    A service or a program with windows can start with closed streams. Characters that the encoding
+    of a stream lacks are escaped, too.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # has this number, which no other file may get
+            os.open(os.devnull, os.O_RDWR)  # gets this number, which no other file must get
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115
@@ -49,14 +49,14 @@ def protect_streams() -> None:
 
 
 def _protected(stream: TextIO) -> TextIO:
-    if type(stream) is not io.TextIOWrapper:  # protected, or what captures the output
+    if type(stream) is not io.TextIOWrapper:  # protected already, or replaced to capture the output
         return stream
     encoding, is_by_line = stream.encoding, stream.line_buffering
     return PrintableStream(stream.detach(), encoding, "backslashreplace", line_buffering=is_by_line)
 
 
 def drawing_on(stream: TextIO) -> TextIO:
-    """Return a stream to the same file without escapes, for libraries that draw on a terminal."""
+    """Return a stream to the same file without escaping, for libraries that draw on a terminal."""
     if not isinstance(stream, PrintableStream):
         return stream
     stream.flush()

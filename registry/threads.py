@@ -1,13 +1,11 @@
-"""Threads, event loops and time for programs in which amplifiers must not wait.
+"""Threads, garbage collection, retries and time for programs that control amplifiers.
 
-Blocking work runs in daemon threads, so that neither a cancellation nor an exit waits for it. (A
-program waits for asyncio's own thread pool before it ends, possibly forever if a connection or a
-disk hangs.) Garbage collections are kept short while amplifiers are armed: a full one visits every
-loaded object, which takes 80 ms with the numerical and CAN libraries, and longer than an
-amplifier's watchdog on a busy machine. Pauses between retries increase.
-
-The clock of links and far ends is the event loop's: time.monotonic() on asyncio's own loops,
-virtual time on a loop with a virtual clock.
+- Blocking work runs in daemon threads, so that neither a cancellation nor an exit waits for it.
+  asyncio's own thread pool would delay the end of a program, forever if a connection hangs.
+- Garbage collections are kept short while amplifiers are armed. A full collection takes 80 ms with
+  the numerical and CAN libraries loaded, and on a busy machine longer than an amplifier's watchdog.
+- Pauses between retries increase.
+- `now` is the time of the event loop, which can be virtual.
 """
 
 import _thread
@@ -26,10 +24,10 @@ from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
 CLOSE_TIMEOUT = 0.7
-"""Longest time [s] to close a device; a remote one takes 0.4 s, a program has 1 s to end."""
+"""Maximum time to close a device [s]. A remote device takes 0.4 s; a program has 1 s to end."""
 
 _logger = logging.getLogger(__name__)
-_at_work: set[Future[Any]] = set()
+_running: set[Future[Any]] = set()  # results of running work
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -37,40 +35,40 @@ _T = TypeVar("_T")
 async def in_thread(
     work: Callable[[], _T], *, name: str, undo: Callable[[_T], object] | None = None
 ) -> _T:
-    """Run work in a thread with this name and return its result.
+    """Run work in a thread with this name; return its result, or raise its exception.
 
-    undo: called in a thread with the result of cancelled work, to close the resource that it
-    opened.
+    undo: called in a thread with the result of work that was cancelled, to close a resource that it
+    opened. Raises RuntimeError if the system cannot start a thread.
     """
-    done: Future[_T] = Future()
-    thread = threading.Thread(target=_run, args=(work, done, undo), name=name, daemon=True)
-    _at_work.add(done)
+    future: Future[_T] = Future()
+    thread = threading.Thread(target=_run, args=(work, future, undo), name=name, daemon=True)
+    _running.add(future)
     try:
         thread.start()
     except RuntimeError:  # the system has no more threads
-        _at_work.discard(done)
+        _running.discard(future)
         raise
     try:
-        return await asyncio.wrap_future(done)
+        return await asyncio.wrap_future(future)
     except asyncio.CancelledError:
-        # Finished at the moment of the cancellation.
-        if undo is not None and not done.cancelled() and done.exception() is None:
-            threading.Thread(target=undo, args=(done.result(),), name=name, daemon=True).start()
+        # The work ended just before the cancellation.
+        if undo is not None and not future.cancelled() and future.exception() is None:
+            threading.Thread(target=undo, args=(future.result(),), name=name, daemon=True).start()
         raise
 
 
 def _run(
-    work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None = None
+    work: Callable[[], _T], future: "Future[_T]", undo: Callable[[_T], object] | None = None
 ) -> None:
-    """Do work of `_at_work` and store its result or error; it counts as running until then."""
+    """Do work in the current thread; count it as running until its result is stored."""
     try:
-        _note_result(work, done, undo)
+        _store_result(work, future, undo)
     finally:
-        _at_work.discard(done)
+        _running.discard(future)
 
 
-def _note_result(
-    work: Callable[[], _T], done: "Future[_T]", undo: Callable[[_T], object] | None
+def _store_result(
+    work: Callable[[], _T], future: "Future[_T]", undo: Callable[[_T], object] | None
 ) -> None:
     """Store the result of work, or its error; undo: called with the result of cancelled work.
 
@@ -79,63 +77,63 @@ def _note_result(
     try:
         result = work()
     except Exception as error:
-        _note_error(error, done)
+        _store_error(error, future)
         return
     except BaseException as error:
         failure = RuntimeError(f"work in a thread must return or fail, got {error!r}")
         failure.__cause__ = error
-        _note_error(failure, done)
+        _store_error(failure, future)
         return
     try:
-        done.set_result(result)
-    except InvalidStateError:
+        future.set_result(result)
+    except InvalidStateError:  # cancelled
         if undo is not None:
             undo(result)
 
 
-def _note_error(error: Exception, done: "Future[_T]") -> None:
-    """Store the error of work that was not cancelled."""
+def _store_error(error: Exception, future: "Future[_T]") -> None:
+    """Store the error of work unless it was cancelled."""
     with suppress(InvalidStateError):
-        done.set_exception(error)
+        future.set_exception(error)
 
 
 def are_at_work() -> bool:
-    """Whether `in_thread` has running work, or a result that is not stored yet."""
-    return bool(_at_work)
+    """Whether work is running in a thread, or its result is not stored yet."""
+    return bool(_running)
 
 
 def leave_work() -> None:
-    """End the process immediately if work is running; call this last, when everything else is
-    closed.
+    """End the process immediately, with status 0, if work is running in a thread.
 
-    A library can wait forever for its own threads if a program ends while one is running.
+    Call this last, after everything else is closed. If a program ends in the usual way, a library
+    can wait forever for its own threads.
     """
-    if _at_work:
+    if _running:
         for stream in (sys.stdout, sys.stderr):
-            print(end="", file=stream, flush=True)  # a closed stream is None
+            print(end="", file=stream, flush=True)  # unlike stream.flush(), accepts None
         os._exit(0)
 
 
 class DaemonThreads(ThreadPoolExecutor):
-    """Executor for event loops with a daemon thread for each work item."""
+    """Executor for event loops that starts a daemon thread for each work item."""
 
     def submit(self, work: Callable[_P, _T], /, *args: _P.args, **named: _P.kwargs) -> "Future[_T]":
-        """Start work immediately."""
-        done: Future[_T] = Future()
-        _at_work.add(done)
+        """Start work immediately; raises RuntimeError if the system cannot start a thread."""
+        future: Future[_T] = Future()
+        _running.add(future)
         try:
             # `threading` would wait until the thread runs, a millisecond on a busy machine.
-            _thread.start_new_thread(_run, (partial(work, *args, **named), done))
+            _thread.start_new_thread(_run, (partial(work, *args, **named), future))
         except RuntimeError:  # the system has no more threads
-            _at_work.discard(done)
+            _running.discard(future)
             raise
-        return done
+        return future
 
 
 async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
-    """Close a device in a thread of this name, and wait at most CLOSE_TIMEOUT for it.
+    """Close a device in a thread with this name; wait at most CLOSE_TIMEOUT for it.
 
-    Raises what closing raises.
+    Exceptions of `close` are raised here.
     """
     try:
         async with asyncio.timeout(CLOSE_TIMEOUT):
@@ -145,7 +143,7 @@ async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
 
 
 class LoopThread:
-    """Event loop in a named daemon thread, until `close` or until nothing refers to it."""
+    """Event loop in a named daemon thread; it ends with `close`, or with this object."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
@@ -158,11 +156,11 @@ class LoopThread:
 
     @property
     def is_open(self) -> bool:
-        """Whether it still runs."""
+        """Whether the thread still runs."""
         return self._end.alive
 
     def run(self, work: Coroutine[Any, Any, _T]) -> _T:
-        """Run a coroutine; cancel it if waiting is interrupted."""
+        """Run a coroutine in the thread and wait for its result; cancel it on Ctrl-C."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
@@ -188,15 +186,15 @@ def _end(
         thread.join()
 
 
-_MANY = 10_000  # objects; a collection of fewer takes about a millisecond
+_MANY_OBJECTS = 10_000  # a collection of fewer objects takes about a millisecond
 _building = threading.RLock()
 
 
 @contextmanager
 def no_long_collections() -> Iterator[None]:
-    """Exclude all present objects from garbage collection while the context lasts.
+    """Exclude all existing objects from garbage collection during a `with` block.
 
-    Objects created within it are collected as usual. Enter it once everything is set up.
+    Objects created in the block are collected as usual. Enter it when everything is set up.
     """
     gc.collect()
     gc.freeze()
@@ -208,10 +206,10 @@ def no_long_collections() -> Iterator[None]:
 
 @contextmanager
 def without_collections() -> Iterator[None]:
-    """Create objects in a thread without garbage collections, which skip them later if they are
-    many.
+    """Turn off garbage collection during a `with` block that creates objects in a thread.
 
-    A few objects are collected as usual, since excluded garbage is never freed.
+    If they are many, later collections skip them. If they are few, they are collected as usual,
+    because garbage that is skipped is never freed.
     """
     with _building:
         is_outermost = gc.isenabled()
@@ -219,20 +217,24 @@ def without_collections() -> Iterator[None]:
         try:
             yield
         finally:
-            if gc.get_count()[0] > _MANY:
+            if gc.get_count()[0] > _MANY_OBJECTS:
                 gc.freeze()
             if is_outermost:
                 gc.enable()
 
 
-FIRST_PAUSE = 0.1  # s; a loose contact recovers within it
-MAX_PAUSE = 5.0  # s; the longest wait after an adapter was plugged in again
+FIRST_PAUSE = 0.1
+"""First pause between retries [s]; a loose contact recovers in this time."""
+
+MAX_PAUSE = 5.0
+"""Maximum pause between retries [s]: the longest wait after an adapter was plugged in again."""
+
 GOOD_TIME = 60.0
 """Time of successful operation [s] after which pauses are reset."""
 
 
 def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[float]:
-    """Yield pauses [s] between attempts, each twice the previous one."""
+    """Yield pauses between attempts [s], each twice the previous pause, up to a maximum."""
     pause = first
     while True:
         yield pause
@@ -240,27 +242,31 @@ def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[f
 
 
 class Backoff:
-    """Pauses [s] before restarts: each twice the previous one, reset after a good run."""
+    """Pauses before restarts of a program: each twice the previous pause, reset after a good run.
+
+    first, maximum: the shortest and the longest pause [s].
+    """
 
     def __init__(self, first: float, maximum: float) -> None:
         self._bounds = first, maximum
         self._pauses = pauses(*self._bounds)
 
     def pause(self, *, ran_for: float) -> float:
-        """Return the pause before the restart of a program that ran for a time [s]."""
+        """Return the pause [s] before the restart of a program that ran for a time [s]."""
         if ran_for >= GOOD_TIME:
             self._pauses = pauses(*self._bounds)
         return next(self._pauses)
 
 
 async def stop_accepting(server: asyncio.Server) -> None:
-    """Close a server's sockets, with every connection open that was accepted.
+    """Close a server's listening sockets; connections that it has accepted stay open.
 
-    Before Python 3.12 a server that closes meanwhile drops them without a word.
+    Before Python 3.12, `close` alone drops connections that are being opened.
     """
-    for each in server.sockets:
-        asyncio.get_running_loop().remove_reader(each)
-    for _ in range(3):  # iterations in which accepted connections are opened
+    loop = asyncio.get_running_loop()
+    for socket in server.sockets:
+        loop.remove_reader(socket)
+    for _ in range(3):  # iterations of the loop in which accepted connections are opened
         await asyncio.sleep(0)
     server.close()
 

@@ -1,9 +1,8 @@
-"""Virtual time: an event loop whose clock jumps to its next timer as soon as nothing is ready.
+"""Event loop with virtual time: if no task is ready, the clock jumps to the next timer.
 
-Computing takes no time on this clock. A program that runs entirely in one loop therefore gives the
-same results on every machine, and ends as soon as they are computed. Sockets work as usual and cost
-no time, so they are reproducible only if the machine delivers data immediately, as Unix sockets
-within a process do.
+Computing takes no virtual time. A program that runs in a single loop therefore gives the same
+results on every machine, and never waits for a timer. Sockets work as usual. Results are
+reproducible only if data arrives immediately, as through Unix sockets within a process.
 """
 
 import asyncio
@@ -18,9 +17,9 @@ from registry import threads
 T = TypeVar("T")
 
 START = 1000.0
-"""Time [s] at which the clock begins; not zero, which code could take for "never"."""
-_MAX_TURNS = 20_000  # at one moment; more are an endless loop
-_THREAD_WAIT = 0.001  # s of the machine's time; between looks at threads that work
+"""Virtual time at the start [s]; not zero, because code could use zero for "never"."""
+_MAX_TURNS = 20_000  # of the loop without progress of time; more are an endless loop
+_THREAD_WAIT = 0.001  # s of real time between checks whether threads still work
 
 
 class Stuck(Exception):
@@ -35,7 +34,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         super().__init__(_JumpingSelector(self))
 
     def time(self) -> float:
-        """Virtual seconds."""
+        """Return the virtual time [s]."""
         return self.now
 
     @property
@@ -45,17 +44,17 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
     @property
     def _clock_resolution(self) -> float:
-        """Resolution of the clock: the smallest step, so that no timer fires early."""
+        """Resolution of the clock: the smallest possible step, so that no timer fires early."""
         return math.ulp(self.now)
 
     @_clock_resolution.setter
-    def _clock_resolution(self, of_the_machine: float) -> None:
-        """Ignore the resolution of the machine's clock."""
+    def _clock_resolution(self, resolution: float) -> None:
+        """Ignore the resolution of the machine's clock, which asyncio sets."""
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., T], *args: Any
     ) -> "asyncio.Future[T]":
-        """Run the function immediately: there are no threads."""
+        """Run the function immediately in the loop's thread."""
         future: asyncio.Future[T] = self.create_future()
         try:
             future.set_result(func(*args))
@@ -65,7 +64,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Never waits for a timer: it moves the clock there. It waits for threads that work."""
+    """Selector that advances the virtual clock to the next timer, but waits for working threads."""
 
     def __init__(self, loop: VirtualTimeLoop) -> None:
         super().__init__()
@@ -73,15 +72,17 @@ class _JumpingSelector(selectors.DefaultSelector):
         self._turns = 0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return the ready events; if there are none and a timer is set, advance the clock to
-        it."""
+        """Return the ready events; if no event is ready, advance the clock to the next timer.
+
+        Raises Stuck for a deadlock.
+        """
         self._turns += 1
         if self._turns > _MAX_TURNS:
             self._turns = 0
             raise Stuck(f"{_MAX_TURNS} turns at one moment: a task reschedules itself endlessly")
-        # Nothing but the loop's own pipe, and no thread that could write to it.
+        # Only the loop's own pipe is registered, and no other thread could write to it.
         is_alone = len(self.get_map()) == 1 == threading.active_count()
-        # Before looking at the pipe: a thread writes to it first, and is no longer at work then.
+        # Read before the pipe: a thread first writes its result to the pipe, then stops working.
         is_held = timeout != 0 and not is_alone and self._loop.waits_for_threads
         ready = [] if is_alone else super().select(0)
         if ready or timeout == 0:

@@ -1,22 +1,9 @@
-"""Reword errors of pydantic and typer like all other errors."""
+"""Error messages of pydantic and typer in the wording of this project."""
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # slow to import
     from pydantic import ValidationError
-
-
-def reworded(message: str) -> str:
-    """Reword a message of pydantic or typer like all other errors."""
-    for theirs, ours in _WORDS.items():
-        message = message.replace(theirs, ours)
-    return message
-
-
-def first_problem(error: "ValidationError") -> tuple[str, str]:
-    """Return the position of the first invalid value, "" for the whole, and its error."""
-    first = error.errors()[0]
-    return ".".join(str(part) for part in first["loc"]), reworded(first["msg"])
 
 
 _WORDS = {
@@ -32,3 +19,21 @@ _WORDS = {
     "Choose from:\n\t": "Choose from ",
     ",\n\t": ", ",
 }
+"""Phrases of the libraries, and their replacements."""
+
+
+def reworded(message: str) -> str:
+    """Return a message of pydantic or typer in the wording of this project."""
+    for phrase, replacement in _WORDS.items():
+        message = message.replace(phrase, replacement)
+    return message
+
+
+def first_problem(error: "ValidationError") -> tuple[str, str]:
+    """Return the location and the message of the first invalid value.
+
+    The location is a path such as `plate.thickness`, or "" for the document as a whole.
+    """
+    problem = error.errors()[0]
+    location = ".".join(str(key) for key in problem["loc"])
+    return location, reworded(problem["msg"])

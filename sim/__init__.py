@@ -1,1 +1,1 @@
-"""The far end, of era-haptics: simulated amplifiers on real wires over a plate that vibrates."""
+"""Simulator of era-haptics: simulated amplifiers on real transports, with a vibrating plate."""

@@ -31,7 +31,7 @@ from model.table.table import LocalizationTable
 
 _SILENT_DB = -60.0  # gain at which a content is not felt
 _AMPLITUDES = np.array([1.0, 0.5, 0.5])  # of carrier and side bands
-_ALL_DB = 20 * math.log10(float(np.linalg.norm(_AMPLITUDES)))  # all three, above the carrier
+_ALL_DB = 20 * math.log10(float(np.linalg.norm(_AMPLITUDES)))  # of all, relative to the carrier
 _NEAR = 2  # carriers tried on each side of the steady one, in table frequencies
 _MAX_ASYMMETRY = 0.5  # Hz; of the side bands about the carrier
 _ROUNDING_DB = 1e-3  # difference of promises that counts as equal
@@ -98,8 +98,8 @@ def _fitting_carriers(
 
 
 def is_served(result: Answer, steady: Answer) -> bool:
-    """Return whether all fingers meet their requirements, and have at least 6 dB unless they had
-    less."""
+    """Return whether all fingers meet their requirements, with a contrast of at least 6 dB, or of
+    the steady answer if that is lower."""
     worst_db = result.promised_worst_db
     steady_worst_db = steady.promised_worst_db
     if result.lacks_contrast or result.disturbed:
@@ -110,7 +110,7 @@ def is_served(result: Answer, steady: Answer) -> bool:
 
 
 def _carriers(table: LocalizationTable, steady_row: int, modulation: float) -> Iterator[list[int]]:
-    """Yield rows of a carrier near a steady one, and of the side bands nearest to a modulation."""
+    """Yield the rows of possible carriers near a steady one, each with rows of its side bands."""
     frequencies = table.frequencies
     first = max(steady_row - _NEAR, 0)
     end = min(steady_row + _NEAR + 1, len(frequencies))
@@ -251,8 +251,10 @@ def as_quiet_fingers_allow(table: LocalizationTable, result: Answer) -> Answer:
 
 
 def _loudest_db_sl(foreign_db_sl: Sequence[Sequence[float]], fingers: Sequence[int]) -> float:
-    """Return the highest foreign level at fingers, relative to the rig's own thresholds; else
-    -inf."""
+    """Return the highest foreign level at some fingers, relative to the rig's own thresholds.
+
+    -inf without fingers.
+    """
     return max([foreign_db_sl[finger][0] for finger in fingers], default=-math.inf)
 
 
@@ -282,7 +284,7 @@ def gains_within(table: LocalizationTable, result: Answer, limits: Limits) -> Fl
     """Compute gains [dB] on the layers of an answer that bring them within the amplifiers' limits.
 
     Limits are shared like the stroke: lower priorities are reduced first, and louder layers first
-    among equal priorities. A layer's power counts by its share of the total.
+    among equal priorities. Layers share the allowed power in proportion to their own.
     """
     full_levels = table.full_levels
     highest = limits.amplitudes or full_levels

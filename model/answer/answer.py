@@ -59,7 +59,7 @@ class Sensation:
     """`own`; `mixed`; `shared`; `held back`; or `quiet`.
 
     A vibration is mixed below OWN_CONTRAST_DB, or if it pauses while others are felt. `shared`: the
-    vibration of another finger. `held back`: not played; the contrast is what it would have had.
+    vibration of another finger. `held back`: not played, with the contrast that it would have had.
     """
     layer: int | None = None
     """Number of the layer that plays the finger's vibration, None if no layer does."""
@@ -128,7 +128,7 @@ class Layer:
     """Shaped ending instead of the ramp."""
     drive_mode: str = UNRESTRICTED
     contrast_to_plate_db: float | None = None
-    """Level relative to the plate more than 50 mm away (RMS), if there is no other finger."""
+    """Level relative to the plate more than 50 mm away (RMS); None if there are other fingers."""
     swings: tuple[Swing, ...] = ()
     """Possible envelopes of the layer's level; empty for a continuous layer."""
 
@@ -195,7 +195,7 @@ class Limits:
     power: float = math.inf
     """Sum of the squared levels of all ERAs."""
     slew: float = math.inf
-    """Fastest rise of a level [1/s]."""
+    """Maximum rise of a level [1/s]."""
     excursion: float = 1.0
     """Usable fraction of the magnets' excursions."""
 

@@ -1,10 +1,10 @@
 """Envelopes of stimuli and drives: pulses, courses and ramps, and their effect at fingers.
 
-The plate follows its drive late: over 40 ms, the RMS at a finger is several decibels below that of
-the steady vibration, ten decibels on a sharp resonance, and the plate rings after the end.
-Therefore a finger is assumed to feel the mean of its demodulated acceleration over the duration.
-Any other fingertip counts by its power, including ringing. With a course, both are evaluated over
-the strongest moments (`DriveEnvelope`).
+The plate needs time to follow its drive. Over 40 ms, the RMS at a finger is several decibels below
+the steady vibration, and ten decibels below it on a sharp resonance; the plate rings after the end.
+The model therefore assumes that a target finger feels the mean of its demodulated acceleration over
+the duration. At other fingers, the power counts, including ringing. With a course, both are
+evaluated over its strongest moments (`DriveEnvelope`).
 """
 
 import math
@@ -39,7 +39,7 @@ COURSE_KNOT_STEP = 0.010
 enough."""
 
 STRONGEST = 0.040
-"""Total time of the strongest moments by which an envelope is felt [s]."""
+"""Total time of the strongest moments of an envelope, which determine how it feels [s]."""
 
 SILENCE = 1e-6
 """Replaces 0, so that levels are finite."""
@@ -145,7 +145,7 @@ class Course:
         return np.asarray(fractions)
 
     def _played_at(self, knots: FloatArray) -> FloatArray:
-        """Return fractions at the knots [s] (n,) of one playback, 0 from its end on."""
+        """Return fractions at knots (n,) [s] of a single playback; 0 after its end."""
         return np.where(knots < self.duration, self.at(knots), 0.0)
 
     def at(self, times: FloatArray) -> FloatArray:
@@ -216,7 +216,7 @@ class DriveEnvelope:
     step: float
     """Time [s] between values."""
     within: int
-    """Number of steps over which it is felt: the strongest ones of an envelope, else the first."""
+    """Number of steps that are felt: the strongest steps of a course, the first of a pulse."""
     share: float = 1.0
     """Fraction of the duration covered by these steps; the rest is steady."""
     is_course: bool = False

@@ -18,7 +18,7 @@ from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, To
 from model.table.table import FingertipShapes, LocalizationTable, read_fingertips
 
 CENTER_AND_RIM = np.array([0, *range(9, 21)])
-"""Indices of fine points of a fingertip between which no null can hide."""
+"""Indices of fine points of a fingertip, so close that no null fits between them."""
 
 CENTER_AND_FOUR = np.array([0, 9, 12, 15, 18])
 """Indices of a few fine points of a fingertip."""
@@ -193,7 +193,7 @@ class FingerForms:
     ) -> Forms:
         """Return the forms of a search for targets and other fingers, both by index.
 
-        background (f, n, n): form of the rest of the plate, if there are no other fingers.
+        background (f, n, n): form of the rest of the plate, used without other fingers.
         """
         targets = [*targets]
         others = [*others]

@@ -76,7 +76,7 @@ class _FingerLoads:
 
 @dataclass(frozen=True, eq=False)
 class _Fingers:
-    """What depends on the number of fingers alone."""
+    """Data that depends only on the number of fingers."""
 
     judging: PlateDraws
     """Draws on which candidates are evaluated."""
@@ -236,7 +236,7 @@ def _grouped(values: Iterable[_T], size: int) -> list[tuple[_T, ...]]:
 
 
 def _packed_rules(table: LocalizationTable) -> Rules:
-    """Pack the rules by which tones are chosen, and the table's figures."""
+    """Pack the rules for choosing tones, and the table's figures."""
     uncertainty = table.uncertainty
     groups = table.clocks.groups
     gain_variance = uncertainty.gain_variance
@@ -282,7 +282,7 @@ def _packed_rules(table: LocalizationTable) -> Rules:
 
 
 def _packed_method(method: drive_modes.LawsonMethod) -> WeightSearch:
-    """Pack how weights are computed at each frequency."""
+    """Pack the parameters of the search for weights."""
     return WeightSearch(
         steps=method.steps,
         limited=method.is_limited,

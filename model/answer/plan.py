@@ -4,9 +4,9 @@ Every finger that requests a vibration gets its own, as long as the worst finger
 contrast. Otherwise fingers share: the nearest first, and only if they allow it. Two fingers that
 could not be separated even if they were alone on the plate come before two that merely allow
 sharing. If that is not enough, vibrations are served one after the other, by priority and arrival,
-each only if the previous ones leave room for it. A vibration that could not be kept from the next
-finger anyway comes last. If not even the first can be served, the best answer tried is returned,
-except that bounds set by fingers always hold, by silence if necessary.
+each only if the previous ones leave room for it. A vibration that cannot be kept from the nearest
+finger in any case comes last. If not even the first can be served, the best answer tried is
+returned. Limits that fingers set always hold; if necessary, a vibration is held back.
 
 Modulation, the levels that quiet fingers allow and the amplifiers' limits follow
 (`model.answer.adjustments`).
@@ -65,7 +65,7 @@ With more, 34 of 36 sets with two quiet fingers ended with one vibration for all
 """
 
 CONTENTS_A_STEP = 3
-"""One in this many vibrations (at least one) is merged before the rest is evaluated again."""
+"""Each round merges one in this many vibrations, and at least one."""
 
 
 def answer(
@@ -84,14 +84,14 @@ def answer(
     """Answer all fingers together, each with its own vibration.
 
     Args:
-        table: of the plate on which the fingers are.
+        table: localization table of the plate.
         fingers: with their stimuli.
         quiet: more fingers, which should feel nothing.
-        drive_mode: default the table's; must be `phased` for more than one vibration.
+        drive_mode: by default the table's; must be `phased` for more than one vibration.
         shaped: whether the amplifiers play shaped onsets and endings, which `Timing` adds.
         apart_hz: minimum distance of the frequencies from each other and from avoided_hz,
             if their bands allow it.
-        avoided_hz: frequencies that are playing already.
+        avoided_hz: frequencies of vibrations that are playing already.
         bands_may_swap: whether fingers can swap bands.
         min_contrast_db: promised contrast of the worst finger below which fingers give way.
         limits: of the amplifiers.
@@ -241,7 +241,7 @@ class _Search:
     def within_limits(self, result: Answer) -> Answer:
         """Reduce the answer to the amplifiers' limits.
 
-        If this would leave a finger unserved, all are answered again at the lower levels.
+        If this would leave a finger unserved, all fingers are planned again at the lower levels.
         """
         result = as_ramps_allow(self.table, result, self.limits)
         factor = self.limits.factor_within(result.layers, self.table)
@@ -295,8 +295,8 @@ class _Search:
 
     @cached_property
     def _first_contents(self) -> tuple[tuple[int, ...], ...]:
-        """Return the fingers of each vibration of the first plan: together if they must feel
-        one."""
+        """Return the fingers of each vibration in the first plan; fingers that must share are
+        together."""
         groups: list[list[int]] = []
         for number, finger in enumerate(self.fingers):
             if finger.stimulus is None:

@@ -23,7 +23,7 @@ from model.finger import decibels
 from model.table.table import LocalizationTable
 
 MIN_RAISED_CONTRAST_DB = 6.0
-"""Minimum contrast [dB] when the drive of a short stimulus is raised: others feel half of it."""
+"""Minimum contrast [dB] of a short stimulus whose drive is raised: 6 dB is a factor of two."""
 
 SIDE_BANDS = 0.02
 """Fraction of a content's power, for one ERA, in side bands at other fingers while weights change.
@@ -83,7 +83,7 @@ def promised(
     """Compute the sensation of the tones of contents.
 
     gains (m,): None for the gains that give the contents' levels; ringing: per content, None for
-    continuous or shaped ones; ways: as in `with_tones`.
+    continuous or shaped ones; ways: see `with_tones`.
     """
     table = fingers.table
     shares = fingers.tips.fine_weights
@@ -140,9 +140,9 @@ def with_tones(
 ) -> Answer:
     """Return the answer with other tones, and the resulting promises.
 
-    gains: of the tones, None for the gains that give the contents' levels. ways: fingers, by
-    number, that are points on the path of each of the first fingers; each of these feels the mean
-    power there.
+    gains: of the tones, None for the gains that give the contents' levels. ways: for each of the
+    first fingers, the numbers of the fingers that represent points on its path; the finger feels
+    the mean power over these points.
     """
     contents = answer.contents
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
@@ -295,8 +295,8 @@ def _gains_to_levels(
 ) -> FloatArray:
     """Return gains (K,) that give contents their levels on 90 % of plates.
 
-    A short stimulus reaches its level on the nominal plate. It is raised only while others feel at
-    most half of it, or nothing.
+    A short stimulus reaches its level on the nominal plate. It is raised only as long as other
+    fingers feel at most half its amplitude, or nothing.
     """
     levels = contents.levels.astype(float)
     imperceptible = 10 ** (IMPERCEPTIBLE_DB_SL / 20)
@@ -378,7 +378,7 @@ def felt_amplitudes(
     """Return the lowest amplitude of a content's own tones at its targets, (d,).
 
     power (m, k, p, d): of all tones; shares (k, p): weights of the points in the mean over a
-    fingertip. Tones of other contents at the same row (m,) can cancel part of it.
+    fingertip. Tones of other contents at the same row (m,) can partly cancel the content.
     """
     squares = np.zeros(power.shape[1:], dtype=power.dtype)
     for tone in np.flatnonzero(is_own).tolist():

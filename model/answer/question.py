@@ -1,22 +1,24 @@
-"""Question to the tone search, and its answer: used by the C kernel and by its numpy reference.
+"""Question to the tone search (`Contents`), and its result (`Tones`).
 
-The kernel (`model.answer.kernel_question`) and the reference (`model.answer.tone_search`) both take
-`Contents` and the constants below, and return `Tones`.
+The C kernel (`model.answer.kernel_question`) and its numpy reference (`model.answer.tone_search`)
+both take `Contents` and the constants below, and return `Tones`.
 
-K contents are each meant for their own fingers and kept from all others. Content j alone is a
-question with its fingers as targets and all others quiet, so K contents are K searches over one
-loaded plate; weights shared between contents gain 0.3 dB at most. Contents have different
-frequencies, so their powers add. From a few candidates for each content, the combination is chosen
-that has the best contrast at the worst finger on drawn plates. Promises are computed on other
+Each of K contents has its own target fingers, and must not be felt by other fingers. Contents have
+different frequencies, so their powers add. Each content is searched separately, with its fingers as
+targets and all others quiet, on the same plate with fingers. (Weights shared between contents would
+gain 0.3 dB at most.) A search returns a few candidates. Among all combinations of candidates, the
+best has the highest contrast at the worst finger on drawn plates. Promises are computed with other
 draws, the same for all tones. The contrast at finger k is
 
     C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k,
 
 and at a quiet finger the ratio of the weakest content to all contents together. A single content
-uses the tone with the highest contrast at its level. Since contents differ in frequency, a contrast
-depends on the thresholds: the lowest over the table's threshold sets counts, in the choice and in
-the promise. The weights of a content do not depend on the threshold set. Its second harmonics do,
-and candidates are judged by the set with the loudest harmonics.
+uses the tone with the highest contrast at its level.
+
+Because contents differ in frequency, a contrast depends on the thresholds. The lowest contrast
+over the table's threshold sets counts, both in the choice and in the promise. The weights of a
+content do not depend on the threshold set. The levels of its second harmonics do; candidates are
+evaluated with the set in which these are highest.
 """
 
 import cmath

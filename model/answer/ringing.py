@@ -1,4 +1,4 @@
-"""Drives of limited duration on a table's plate with fingers: their spectra, and what is felt."""
+"""Drives of limited duration on a plate with fingers: spectra, and the sensations of fingers."""
 
 import math
 from collections.abc import Iterable
@@ -17,8 +17,8 @@ from model.table.table import LocalizationTable, read_fingertips
 from model.transients.time_response import enveloped_accelerations
 
 _MAX_DISTANCE = 60.0  # Hz; of the tones that represent a drive
-_LEAST_SHARE = 1e-3  # of a tone, of the power of the drive's strongest moments
-_LEAST_PERIODS = 1.7  # beyond this, by 1/duration of a pulse, is 1.4 % of its energy
+_LEAST_SHARE = 1e-3  # minimum power of a tone, relative to the drive's strongest moments
+_LEAST_PERIODS = 1.7  # minimum number in a pulse; 1.4 % of its energy is below 0 Hz then
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,8 @@ class RingingUnderFingers:
         """Return the rows whose spectrum does not reach down to 0 Hz; all rows if every spectrum
         does.
 
-        A drive of fewer periods moves the plate as a whole, which no frequency of a table shows.
+        A drive with fewer periods moves the plate as a whole. The frequencies of a table cannot
+        represent this motion.
         """
         if self.envelope.is_course:
             return rows

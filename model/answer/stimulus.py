@@ -1,6 +1,6 @@
-"""Fingers on a plate with their requests, and the checks of these.
+"""Fingers on a plate with the stimuli that they should feel, and checks of the input.
 
-A stimulus is continuous, or has a duration with a constant level or an envelope
+A stimulus is continuous or has a duration, with a constant level or an envelope
 (`model.answer.envelope`).
 """
 
@@ -50,7 +50,7 @@ _UNITS = {
 }
 
 _SHARED_BY_ALL = ("duration", "course", "is_limit")
-"""Attributes of a stimulus that are the same for all fingers of one vibration."""
+"""Attributes of a stimulus that are equal for all fingers that feel the same vibration."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class Finger:
         # Types are tested first: most fingers pass, and calls would take longer.
         if type(self.at) is not tuple or [*map(type, self.at)] != [float, float]:
             position = _pair(
-                self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in meters"
+                self.at, what="position of a finger", such_as="(0.08, 0.06), x and y in meters"
             )
             object.__setattr__(self, "at", position)
         for what, unit in _UNITS.items():
@@ -216,7 +216,7 @@ class Finger:
 
     @property
     def is_load(self) -> bool:
-        """Whether only its load counts: a resting hand, or a finger without any request."""
+        """Whether the finger is only a load: a resting hand, or a finger without any request."""
         has_no_request = self.stimulus is None and not self.is_protected
         return has_no_request or self.load > MAX_FINGER_LOAD
 
@@ -260,7 +260,7 @@ class Placement:
 
     @property
     def contacts(self) -> tuple[Point, ...]:
-        """All places, targets first."""
+        """All positions, targets first."""
         return (*self.targets, *self.quiet)
 
 

@@ -108,7 +108,7 @@ class _Candidates:
 
 @dataclass(frozen=True, eq=False)
 class _Judgement:
-    """What m candidates give on d drawn plates.
+    """Levels of m candidates on d drawn plates.
 
     Scaled to the contents' levels if there are several contents.
     """
@@ -211,7 +211,7 @@ class _SearchResult:
     """The best weights for a content at some of the solved rows."""
 
     places: IntArray
-    """Places of the rows among the solved ones."""
+    """Indices of the rows among the solved rows."""
     result: CoherentResult
     is_limited: bool
     """Whether the level was hard to reach."""
@@ -219,7 +219,7 @@ class _SearchResult:
 
 @dataclass(frozen=True, eq=False)
 class _ContentSearch:
-    """The search for tones of one content at the solved rows."""
+    """Search for the tones of a content at the solved rows."""
 
     finger_forms: FingerForms
     steady: Forms
@@ -227,7 +227,7 @@ class _ContentSearch:
     others: Sequence[int]
     """Fingers from which the content is kept."""
     ringing: RingingUnderFingers | None
-    """None for a content without a duration, or without other fingers, which ringing disturbs."""
+    """None for a continuous content, or without other fingers that ringing could disturb."""
 
     def results(
         self, places: IntArray, groups: Sequence[NDArray[np.bool_]]

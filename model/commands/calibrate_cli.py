@@ -35,19 +35,19 @@ _HEADING = re.compile(rb"# .* by `era (calibrate|outputs|rig identify|rig merge)
 """First line of a file that a command fitted, or of an empty one."""
 
 _NO_FIT = (
-    "the fit must predict the measurement within 25 %; no rig is written. Check that it is this "
-    "plate, places of sensors and ERAs, noise, phases as exp(+i omega t), and that the rig's mesh "
-    "is as fine as auto"
+    "the fit must predict the measurement within 25 %; no rig is written. Check that the rig "
+    "describes this plate, the positions of sensors and ERAs, noise, the sign of phases "
+    "(exp(+i omega t)), and that the rig's mesh is as fine as auto"
 )
 
 _UNCHECKED = (
-    "the fit must be checked by a sensor that it was not shown; no rig is written. Few responses "
-    "are explained by a wrong plate as well: measure at {least} places or more, better at eight"
+    "the fit must be checked with a sensor that it does not use; no rig is written. A wrong plate "
+    "can explain few responses, too: measure at {least} positions or more, preferably at eight"
 )
 
 _DEAD = (
-    "every ERA that is played must move the plate, {eras} did not; no rig is written. Find out why "
-    "by era rig check, or remove it from the rig"
+    "every ERA that is driven must move the plate, {eras} did not; no rig is written. Find the "
+    "cause with era rig check, or remove the ERA from the rig"
 )
 
 

@@ -1,4 +1,4 @@
-"""Options, parsed values and reports that several commands share."""
+"""Options, parsing and reports that several commands share."""
 
 import json
 import os
@@ -28,7 +28,7 @@ MeshOption = Annotated[
     str | None,
     typer.Option(
         metavar="NXxNY",
-        help="Mesh, as in a rig file: auto, 12x9 or '12x9 Q3'. Default: the rig's.",
+        help="Mesh, written like in a rig file: auto, 12x9 or '12x9 Q3'. Default: the rig's.",
     ),
 ]
 FittedRigOption = Annotated[

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _MAX_LINE = 1 << 20  # characters of a question in a batch
 _MAX_EMPTY = 1000  # lines before the first question
 
-_COARSE_ERROR = 5.0  # % of the fields, as large as the error of a gain
+_COARSE_ERROR = 5.0  # % of the fields; the error of a gain is as large
 
 table_app = typer.Typer(help="Build, query and check localization tables.")
 
@@ -357,7 +357,7 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer), flush=is_piped)
     except BrokenPipeError:
-        raise  # the reader of the answers has gone
+        raise  # the program that reads the answers has ended
     except OSError as error:
         raise InputError(
             f"--batch {batch} cannot be read: {error.strerror}; give a file of JSON lines"
@@ -381,9 +381,9 @@ def _lines_of_batch(batch: Path, *, is_piped: bool) -> Iterator[Iterator[str]]:
 
 
 def _questions_of(batch: Path, lines: Iterator[str]) -> Iterator[str]:
-    """Lines of a file, once the first that is not empty looks like a question.
+    """Yield the lines of a file.
 
-    Raises InputError for another kind of file, which would have an error for each line.
+    Raises InputError for another kind of file: if the first line with text is no JSON object.
     """
     empty_lines: list[str] = []
     got = "none"
@@ -484,7 +484,7 @@ def _map_rows(contrast: "ContrastMap") -> Iterator[str]:
             low, median, high = np.percentile(finite, [10, 50, 90])
             median_nominal = np.median(nominal[np.isfinite(nominal)])
             yield (
-                f"median {median:.1f} dB, one place in ten below {low:.1f}, one above {high:.1f}; "
+                f"median {median:.1f} dB, 10th percentile {low:.1f}, 90th percentile {high:.1f}; "
                 f"median nominal {median_nominal:.1f}"
             )
         yield ""

@@ -101,7 +101,7 @@ def _cell_rows(summary: dict[str, Any], map_grid: str) -> dict[str, str]:
     return {
         "feasible cells": f"{feasible} of {map_grid} ({WANTED_DB:g} dB or more to the median "
         "finger)",
-        "weak cells": f"{weak} of {map_grid} (below {WANTED_DB:g} dB to one finger in ten)",
+        "weak cells": f"{weak} of {map_grid} (below {WANTED_DB:g} dB to 10 % of fingers)",
         "dead zones": f"{dead} (below {FELT_DB_SL:g} dB SL at full stroke)",
         "least level": f"{level:.1f} dB SL at full stroke",
     }

@@ -86,19 +86,19 @@ class PlateDraws(Structure):
 
 
 class Sensors(Structure):
-    """Points of all fingers: `sensors` in C."""
+    """Observed points of all fingers: `sensors` in C."""
 
     _fields_ = _fields(i="points", p="rows weights error threshold")
 
 
 class WeightSearch(Structure):
-    """How weights are computed at each frequency: `method` in C."""
+    """Parameters of the search for weights: `method` in C."""
 
     _fields_ = _fields(i="steps limited", f="variance gain reserve growth most")
 
 
 class Rules(Structure):
-    """How tones are chosen: `rules` in C."""
+    """Rules for choosing tones: `rules` in C."""
 
     _fields_ = [
         *_fields(i="kept missing max_by_point pruning_step"),
@@ -114,7 +114,7 @@ class Rules(Structure):
 
 
 class GivenRaster(Structure):
-    """Shapes of the plate, and how they are read under a fingertip: `raster` in C."""
+    """Mode shapes on the sampling grid, and their interpolation at fingertips: `raster` in C."""
 
     _fields_ = _fields(
         i="nx ny side_x side_y r few fine",
@@ -140,7 +140,7 @@ class FoundTones(Structure):
 
 
 class Shaping(Structure):
-    """How knots are computed: `shaping` in C."""
+    """Parameters for computing knots: `shaping` in C."""
 
     _fields_ = _fields(
         i="samples steps knots ending_knots iterations", f="ridge penalty relaxation", p="rise"
@@ -163,7 +163,7 @@ KERNEL_FOLDER = Path(__file__).parent
 
 
 def processor_features() -> AbstractSet[str]:
-    """Return the features of this processor by numpy's names; empty if numpy does not tell."""
+    """Return the names of this processor's features in numpy; empty if numpy lacks them."""
     try:
         availability = import_module("numpy._core._multiarray_umath").__cpu_features__
     except (ImportError, AttributeError):  # not a public interface
@@ -182,7 +182,7 @@ class Kernels:
 
 @cache
 def kernels() -> Kernels | None:
-    """Load the fastest kernels for this processor; None if there are none, then numpy computes."""
+    """Load the fastest kernels for this processor; None if only numpy is available."""
     features = processor_features()
     for version in versions():
         path = KERNEL_FOLDER / version.file
@@ -202,10 +202,8 @@ def _load(path: Path, version: Version) -> Kernels | None:
 
 
 WITHOUT_KERNELS = "answers are computed by numpy, which takes 6 to 19 times as long as C kernels"
-"""Measured for steady vibrations of one to twenty sharing fingers, with 0 to 6 quiet fingers.
-
-On four and on twelve ERAs; clicks take 1.3 times as long.
-"""
+"""Measured on four and on twelve ERAs, for steady vibrations of one to twenty sharing fingers with
+0 to 6 quiet fingers; clicks take 1.3 times as long."""
 
 
 def why_slow() -> str | None:

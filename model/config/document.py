@@ -1,9 +1,9 @@
 """YAML files read strictly, with the line of every key, and the text of data.
 
-A file is UTF-8, at most 1 MiB and 50 000 values in 20 levels, one document with a mapping at the
-top, without anchors, aliases or tags, so that nothing expands or gets constructed; all this is
-checked before a value is made. Keys are unique. Words are text unless they are decimal numbers,
-true, false or null (core schema of YAML 1.2).
+A file must be UTF-8, with at most 1 MiB and 50 000 values in 20 levels: a single document with a
+mapping at the top and unique keys. Anchors, aliases and tags are rejected, so that nothing expands
+or constructs objects. All rules are checked before any value is built. Words are text unless they
+are decimal numbers, true, false or null (core schema of YAML 1.2).
 """
 
 import errno
@@ -22,7 +22,7 @@ from registry.files import read_regular
 
 _MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50
-"""Maximum number of reported problems per file; with more it is the wrong kind of file."""
+"""Maximum number of reported problems per file; with more, it is the wrong kind of file."""
 
 IF_EMPTY = "`era config init` writes one to begin with"
 """Remedy for an empty configuration file."""
@@ -69,7 +69,7 @@ class ConfigError(InputError):
 
 @dataclass(frozen=True)
 class Document:
-    """The content of a file and its text; keys that were given in a program have no text."""
+    """The data of a file and its text; data from a program has no text."""
 
     source: str
     text: str
@@ -380,7 +380,7 @@ _WORDS: dict[str, Scalar] = {
 
 def plain_value(text: str) -> Scalar:
     """Return the value of unquoted text in the core schema of YAML 1.2; only decimal numbers."""
-    text = text.strip()  # of blanks that are no spaces, too
+    text = text.strip()  # removes non-breaking spaces, too
     if text in _WORDS:
         return _WORDS[text]
     if not _NUMBER.fullmatch(text):
@@ -389,7 +389,7 @@ def plain_value(text: str) -> Scalar:
     return int(text) if is_whole else float(re.sub(r"\.(?=[inIN])", "", text))
 
 
-# Longer numbers stay text, and are refused as such.
+# Longer numbers stay text, and are rejected as text.
 _NUMBER = re.compile(
     r"[-+]?(?:[0-9]{1,18}|(?:\.[0-9]{1,30}|[0-9]{1,30}(?:\.[0-9]{0,30})?)(?:[eE][-+]?[0-9]{1,3})?)"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"

@@ -133,7 +133,7 @@ def _file_name(text: str) -> str:
 
 
 FileName = Annotated[str, AfterValidator(_file_name)]
-"""Type of the name of a file; relative ones count from the folder of the file that has it."""
+"""Type of a file name; relative names start at the folder of the file that contains them."""
 
 
 def quantities(field: FieldInfo) -> list[Quantity]:
@@ -382,7 +382,7 @@ class Rectangle:
         return (self.x + self.width / 2, self.y + self.height / 2)
 
     def corners(self) -> Sequence[_Point]:
-        """Return all four."""
+        """Return the four corners."""
         east, north = self.x + self.width, self.y + self.height
         return ((self.x, self.y), (east, self.y), (east, north), (self.x, north))
 
@@ -411,7 +411,7 @@ class Circle:
 
     @property
     def centre(self) -> _Point:
-        """The center."""
+        """The center of the circle."""
         return (self.x, self.y)
 
     def corners(self) -> Sequence[_Point]:
@@ -434,7 +434,8 @@ class Polygon:
     points: tuple[_Point, ...]
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a ray to the east crosses the sides an odd number of times."""
+        """Return whether a point is within the polygon: a ray to the east crosses its sides an odd
+        number of times."""
         if not self._box.contains(x, y):
             return False
         is_within = False
@@ -524,7 +525,7 @@ class ShapedSection(Section):
 
     @property
     def shape(self) -> RegionShape:
-        """That shape."""
+        """The shape of the section."""
         if self.rectangle is not None:
             (x0, y0), (x1, y1) = self.rectangle.start, self.rectangle.end
             return Rectangle(min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0))

@@ -33,7 +33,7 @@ class Dimension:
     """Example for messages."""
 
     factors: Mapping[str, str] = field(default_factory=dict, compare=False)
-    """Factors of common units. Loading pint, which knows all units, doubles a command's start."""
+    """Factors of common units, because loading pint doubles the time in which a command starts."""
 
     def key(self, name: str) -> str:
         """Return the JSON key of a value, with its unit: `stiffness_n_m`."""

@@ -1,4 +1,4 @@
-"""CSV files: columns of numbers as one and as a pandas DataFrame, and lines of named columns."""
+"""CSV files: writing columns and rows, and reading lines with named columns."""
 
 import csv
 import io
@@ -121,10 +121,10 @@ def read_lines(
     """Yield the lines of a file whose first line names its columns, in any order.
 
     Columns are separated by commas, semicolons or tabs. With semicolons and tabs a decimal comma is
-    accepted unless some number has a decimal point, since the comma can then separate thousands.
-    Empty lines, remarks above the names (after *, #, ! or //), empty cells behind the last column
-    and unknown columns are skipped. instead: columns that replace the last ones if the file has the
-    first of them.
+    accepted unless a number has a decimal point, because a comma can then separate thousands. Empty
+    lines, remarks above the names (after *, #, ! or //), empty cells behind the last column and
+    unknown columns are skipped. instead: columns that replace the last columns if the file has the
+    first replacement.
 
     The file is read line by line: a damaged file takes no more memory than its first lines. Raises
     InputError with file and line for missing and repeated columns, names that are probably

@@ -313,7 +313,7 @@ class _Modal:
     """Natural frequency [Hz]."""
 
     mass: complex
-    """Modal mass; a shape divided by its square root has unit modal mass."""
+    """Modal mass; a shape has unit modal mass after division by the square root."""
 
     damping_ratio: float
     """Share of critical damping, NaN without one."""

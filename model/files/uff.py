@@ -214,7 +214,7 @@ def open_measured(path: Path) -> Iterator[BinaryIO]:
 class DatasetBlock:
     """One dataset: the line of its opening mark, its number, the content between its marks.
 
-    byte_order: of a binary dataset, as in NumPy; empty for text.
+    byte_order: of a binary dataset, in NumPy's notation; empty for text.
     """
 
     line: int

@@ -440,7 +440,7 @@ REFUSED: dict[str, list[Callable[[], object]]] = {
         lambda: asked(duration=10**400),
         lambda: Stimulus(duration="0.5", course=along(0.5, np.ones(2))),
     ],
-    "place of a finger must be two numbers": [
+    "position of a finger must be two numbers": [
         *(lambda at=at: Finger(at) for at in (np.array(0.1), np.ones((2, 2)), (0.1, "0.1"), {1, 2}))
     ],
     "band_hz must be two numbers": [lambda: Stimulus(band_hz=np.array(40.0))],

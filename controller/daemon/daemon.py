@@ -179,7 +179,7 @@ class Daemon:
             self.config.urls,
             are_open=group.is_open,
             lost=self.supervisor.operation.lost,
-            what_may_play=self.supervisor.what_may_play,
+            what_may_play=self.supervisor.reopening.what_may_play,
             clock_errors=group.clock_errors,
             targets=self.publisher.view.targets,
         )

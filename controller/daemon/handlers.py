@@ -160,7 +160,7 @@ class ApiService:
             cause=operation.cause,
             remedy=operation.remedy,
             epoch=operation.epoch,
-            assume_energised=self._supervisor.assume_energised(now),
+            assume_energised=self._supervisor.reopening.assume_energised(now),
             lost_for_s=None if operation.lost is None else now - operation.lost.at,
             watchdog_s=self._controller.watchdog,
             armed_by=lease.owner if lease else None,

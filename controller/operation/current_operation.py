@@ -102,6 +102,15 @@ class CurrentOperation:
         await self._changed.wait()
         self._changed.clear()
 
+    async def wait_for(self, condition: Callable[[], bool], duration: float) -> bool:
+        """Wait for a condition, checked after each change; False if a time [s] ends before."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(duration):
+                while not condition():
+                    await self.change()
+                return True
+        return False
+
     async def pause(self, duration: float) -> None:
         """Wait for a time [s], or until there is a change."""
         with contextlib.suppress(TimeoutError):

@@ -1,10 +1,18 @@
-"""Judge statuses of amplifiers: whether they are disarmed, silent and without a fault."""
+"""Judge statuses of amplifiers: whether they are disarmed, silent and without a fault.
+
+The supervisor polls disarmed amplifiers; the control loop reads the statuses of armed ones.
+"""
 
 from collections.abc import Mapping
 
 from drivers.host.amplifier import Amplifier
+from drivers.host.group_states import GroupState
 from drivers.protocol.definition import FAULTS, STATES, name_of
 from drivers.protocol.records import Values
+
+STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
+SILENT_GROUP = (GroupState.DISARMED, GroupState.STOPPED)
+"""States of a group that plays nothing."""
 
 _ENABLED = STATES["OPERATION_ENABLED"]
 _DISARMED = STATES["SWITCH_ON_DISABLED"]

@@ -1,87 +1,72 @@
 """Reopening of lost amplifiers, with growing pauses, until all are disarmed and silent."""
 
-import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, TypeAlias
 
 from controller.operation.current_operation import CurrentOperation
 from controller.operation.operation_states import DaemonState, not_reopened
 from controller.operation.plate_controller import Controller
 from drivers.errors import DriverError, LinkError, WrongAmplifier
+from drivers.host.stops import StopOutcome
 from model.errors import InputError
 from registry import threads
 from registry.threads import pauses
 
 _RECHECK = 0.05  # s; between checks of the watchdog of a lost amplifier
-_RETRY_INTERVAL = 0.5  # s; after an unexpected exception
 _REOPENING = "the daemon reconnects on its own and stays disarmed"
 
 LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
 LinkObserver: TypeAlias = Callable[[LinkChange, Sequence[str], str], None]
 """Receives the kind of change, the affected amplifiers, if known, and a message."""
 
-_logger = logging.getLogger(__name__)
-
 
 class Reopening:
-    """Opens lost amplifiers again, while the daemon is in COMM_LOST.
+    """Opens lost amplifiers again while the daemon is in COMM_LOST, and knows what they may play.
 
-    report: receives each attempt. may_play: whether a lost amplifier may still be playing at a time
-    [s]. is_closing: whether the daemon ends. reconnected: called once all amplifiers are silent.
+    report: receives each attempt.
     """
 
     def __init__(
-        self,
-        controller: Controller,
-        current: CurrentOperation,
-        report: LinkObserver,
-        *,
-        may_play: Callable[[float], bool],
-        is_closing: Callable[[], bool],
-        reconnected: Callable[[], Awaitable[None]],
+        self, controller: Controller, current: CurrentOperation, report: LinkObserver
     ) -> None:
         self._controller = controller
         self._current = current
         self._report = report
-        self._may_play = may_play
-        self._is_closing = is_closing
-        self._reconnected = reconnected
 
     @property
     def is_due(self) -> bool:
         """Whether amplifiers are lost, and all lines are closed."""
         return self._current.state is DaemonState.COMM_LOST and self._controller.is_released
 
-    async def run(self) -> None:
-        """Open the amplifiers, and leave COMM_LOST once all are silent; ends early after an error.
+    def assume_energised(self, now: float) -> bool:
+        """Whether a lost amplifier may still be playing at a time [s]."""
+        if self._current.value.lost is None:
+            return False
+        ends = [self.what_may_play(name).may_play_until for name in self._controller.urls]
+        return now < max(ends, default=now)
 
-        If the amplifiers are still lost then, all lines are closed.
+    def what_may_play(self, name: str) -> StopOutcome:
+        """Return what an amplifier may be playing, and why no more is known."""
+        operation = self._current.value
+        lost = operation.lost
+        is_named = lost is not None and name in (lost.names or self._controller.urls)
+        return self._controller.what_may_play(name, operation.cause if is_named else "")
+
+    async def reopen(self) -> bool:
+        """Open the amplifiers, and wait until those that were lost are silent.
+
+        Returns whether all are open; False if the daemon ends, or after a further loss.
         """
-        try:
-            try:
-                await self._reconnect()
-            finally:
-                if self._current.state is DaemonState.COMM_LOST:
-                    await self._controller.release()
-        except DriverError as error:
-            _logger.info("failed: %s", error)
-        except Exception:
-            _logger.exception("reconnection failed")
-            await self._current.pause(_RETRY_INTERVAL)
-
-    async def _reconnect(self) -> None:
-        """Open the amplifiers, and wait until those that were lost are silent."""
         for pause in pauses():
             if self._current.state is not DaemonState.COMM_LOST:
-                return
+                return False
             if await self._open():
                 break
             await self._current.pause(pause)
-        while self._may_play(threads.now()) and not self._is_closing():
+        while self._current.state is DaemonState.COMM_LOST and self.assume_energised(threads.now()):
             await self._current.pause(_RECHECK)
             await self._controller.group.statuses()  # a loud amplifier can have become silent
-        if self._controller.group.is_open:  # no further loss
-            await self._reconnected()
+        return self._controller.group.is_open
 
     async def _open(self) -> bool:
         """Open and disarm all amplifiers, or release them; return whether that worked.

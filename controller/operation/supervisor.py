@@ -10,8 +10,8 @@ before it returns; only a cancellation of `run` ends them early. A stop does not
 tasks: its requests to the amplifiers are queued before the operation changes. An exception that no
 action expects stops all amplifiers in one place (`_guarded`).
 
-The supervisor also runs the control loop, `StatusPolling` of disarmed amplifiers, and the
-`Reopening` of lost ones.
+The supervisor also runs the control loop, polls the statuses of disarmed amplifiers, and opens lost
+ones again (`Reopening`).
 """
 
 import asyncio
@@ -34,14 +34,19 @@ from controller.operation.operation_states import (
     fault_remedy,
 )
 from controller.operation.plate_controller import Controller
-from controller.operation.read_back import find_problem, is_any_armed
+from controller.operation.read_back import (
+    SILENT_GROUP,
+    STATUS_INTERVAL,
+    are_silent,
+    find_problem,
+    is_any_armed,
+)
 from controller.operation.reopening import (
     LinkChange,
     LinkObserver,
     Reopening,
     reopening_remedy,
 )
-from controller.operation.status_polling import SILENT_GROUP, StatusPolling
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -58,6 +63,7 @@ from registry import threads
 
 _LOOP_PAUSE = 0.05  # s; before the control loop runs again after a failure
 _READ_BACK_INTERVAL = 0.02  # s
+_RETRY_INTERVAL = 0.5  # s; after an unexpected exception while amplifiers are reopened
 _MAX_READ_BACKS = 15
 
 LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
@@ -102,23 +108,8 @@ class Supervisor:
         """Set once the daemon ends."""
         self.tasks: set[asyncio.Task[Any]] = set()
         """Actions in progress."""
-        self._reopening = Reopening(
-            controller,
-            self.current,
-            self._report_link,
-            may_play=self.assume_energised,
-            is_closing=self.closing.is_set,
-            reconnected=partial(self.handle, DaemonEvent(Trigger.RECONNECTED)),
-        )
-        self._polling = StatusPolling(
-            controller,
-            self.current,
-            is_over=self._is_polling_over,
-            is_clearing=self._is_clearing,
-            lost=self._lost_while_disarmed,
-            faulty=self._faulty_while_disarmed,
-            stop=self._quick_stop,
-        )
+        self.reopening = Reopening(controller, self.current, self._report_link)
+        """Opens lost amplifiers again."""
         self._link_observer = link_changed
         self._alive = alive
         self._loss_lock = asyncio.Lock()
@@ -156,10 +147,10 @@ class Supervisor:
                 if control_loop.done():  # it never ends by itself, so it was cancelled
                     raise RuntimeError("control loop has ended before the daemon")
                 self.current.note_seen()
-                if self._reopening.is_due:
-                    await self._reopening.run()
-                else:
-                    await self._polling.poll()
+                if self.reopening.is_due:
+                    await self._reopen()
+                elif not await self.current.wait_for(self._is_polling_over, STATUS_INTERVAL):
+                    await self._poll()
         finally:
             while self.tasks:  # a task may start another one
                 await asyncio.gather(*self.tasks, return_exceptions=True)
@@ -218,19 +209,6 @@ class Supervisor:
         lease = self.operation.lease
         if lease is not None and lease.token == token:
             self.post(DaemonEvent(Trigger.DISARM, cause, "arm again"))
-
-    def assume_energised(self, now: float) -> bool:
-        """Whether a lost amplifier may still be playing at a time [s]."""
-        if self.operation.lost is None:
-            return False
-        ends = [self.what_may_play(name).may_play_until for name in self.controller.urls]
-        return now < max(ends, default=now)
-
-    def what_may_play(self, name: str) -> StopOutcome:
-        """Return what an amplifier may be playing, and why no more is known."""
-        lost = self.operation.lost
-        is_named = lost is not None and name in (lost.names or self.controller.urls)
-        return self.controller.what_may_play(name, self.operation.cause if is_named else "")
 
     def _apply(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
         """Apply an event immediately; return its actions, which must be awaited in a task."""
@@ -401,7 +379,7 @@ class Supervisor:
         try:
             await self.controller.open()
         except (LinkError, CommandRefused, FrameError) as error:
-            lost = self._reopening.report_failure(error)
+            lost = self.reopening.report_failure(error)
             remedy = reopening_remedy(error)
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), remedy, amplifiers=lost)
         if self.closing.is_set():
@@ -511,20 +489,59 @@ class Supervisor:
 
     def _is_polling_over(self) -> bool:
         """Whether `run` ends, or must reopen lost amplifiers."""
-        return self.operation.state is DaemonState.NOT_READY or self._reopening.is_due
+        return self.operation.state is DaemonState.NOT_READY or self.reopening.is_due
 
-    def _is_clearing(self, epoch: int) -> bool:
-        """Whether a clear that began in an epoch is in progress."""
-        return epoch in self._clears
+    async def _poll(self) -> None:
+        """Read the statuses of disarmed amplifiers, and react to a loss or problem."""
+        group = self.controller.group
+        if group.state not in SILENT_GROUP:
+            return
+        epoch = self.operation.epoch
+        try:
+            statuses = await group.statuses()
+        except LinkError as error:
+            if not group.members.is_degraded_only(error):
+                await asyncio.shield(self._in_background(self._handle_loss(error)))
+        except DriverError:
+            pass  # preempted by another request, which reports for itself
+        except Exception:
+            _logger.exception("status read failed")
+        else:
+            # Otherwise they may have been read before the present epoch, or during a ramp.
+            if epoch == self.operation.epoch and not group.members.disarming:
+                await self._react_to(statuses)
 
-    async def _lost_while_disarmed(self, error: LinkError) -> None:
-        """Handle the loss of a disarmed amplifier."""
-        await asyncio.shield(self._in_background(self._handle_loss(error)))
+    async def _react_to(self, statuses: Mapping[str, Values]) -> None:
+        """React to statuses of disarmed amplifiers: a fault, or a stop that has not silenced all.
 
-    async def _faulty_while_disarmed(self, problem: str) -> None:
-        """Handle a fault of a disarmed amplifier."""
-        event = DaemonEvent(Trigger.FAULT, problem)
-        await asyncio.shield(self._in_background(self._apply(event)))
+        A clear in progress reads back for itself.
+        """
+        amplifiers = self.controller.group.amplifiers
+        problem = find_problem(statuses, amplifiers)
+        match self.operation.state:
+            case DaemonState.READY_TO_SWITCH_ON if problem is not None:
+                event = DaemonEvent(Trigger.FAULT, problem)
+                await asyncio.shield(self._in_background(self._apply(event)))
+            case DaemonState.QUICK_STOP_ACTIVE | DaemonState.FAULT:
+                is_clearing = self.operation.epoch in self._clears
+                if not is_clearing and not are_silent(statuses, amplifiers):
+                    _logger.error("stop repeated: %s", problem)
+                    await asyncio.shield(self._in_background(self._quick_stop()))
+
+    async def _reopen(self) -> None:
+        """Open lost amplifiers again, and leave COMM_LOST; close all lines if any is still lost."""
+        try:
+            try:
+                if await self.reopening.reopen():
+                    await self.handle(DaemonEvent(Trigger.RECONNECTED))
+            finally:
+                if self.operation.state is DaemonState.COMM_LOST:
+                    await self.controller.release()
+        except DriverError as error:
+            _logger.info("failed: %s", error)
+        except Exception:
+            _logger.exception("reconnection failed")
+            await self.current.pause(_RETRY_INTERVAL)
 
 
 def _log_transition(old: Operation, new: Operation) -> None:

@@ -72,18 +72,18 @@ def said_by_status(daemon: Watched) -> Mapping[str, Mapping[str, object]]:
         controller.urls,
         are_open=controller.group.is_open,
         lost=supervisor.operation.lost,
-        what_may_play=supervisor.what_may_play,
+        what_may_play=supervisor.reopening.what_may_play,
         clock_errors=controller.group.clock_errors,
     )
     now = threads.now()
-    said = {name: supervisor.what_may_play(name).rows(now) for name in controller.urls}
+    said = {name: supervisor.reopening.what_may_play(name).rows(now) for name in controller.urls}
     for each in shown:
         assert (each.silence is None) == (each.state is not None and not each.degraded)
         assert each.silence is None or each.silence.model_dump() == said[each.name]
     may_play = supervisor.operation.lost is not None and any(
         each["silence"] == "may_play" for each in said.values()
     )
-    assert supervisor.assume_energised(now) is may_play
+    assert supervisor.reopening.assume_energised(now) is may_play
     return said
 
 
@@ -667,7 +667,7 @@ async def test_stop_in_progress_is_not_repeated(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A look at the amplifiers finds it at work; one after its end, without silence, does not."""
-    monkeypatch.setattr("controller.operation.status_polling.STATUS_INTERVAL", 0.02)
+    monkeypatch.setattr("controller.operation.supervisor.STATUS_INTERVAL", 0.02)
     async with watched("main") as daemon:
         daemon.answer("Stop", "GetStatus", levels=[1000, 0, 0], state="QUICK_STOP_ACTIVE")
         stopping = asyncio.ensure_future(daemon.supervisor.stop("a test"))
@@ -690,7 +690,7 @@ async def test_reports_of_an_amplifier_are_shown(caplog: pytest.LogCaptureFixtur
                 daemon.controller.urls,
                 are_open=True,
                 lost=None,
-                what_may_play=daemon.supervisor.what_may_play,
+                what_may_play=daemon.supervisor.reopening.what_may_play,
                 clock_errors=daemon.controller.group.clock_errors,
                 targets=["panel 1"],
             )

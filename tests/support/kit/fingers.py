@@ -807,7 +807,7 @@ class Watched(Acted):
     def energised_in(self, seconds: float, expected: bool) -> None:
         """Require that amplifiers are taken for energised, or not, in some seconds."""
         now = threads.now()
-        assert self.supervisor.assume_energised(now + seconds) is expected
+        assert self.supervisor.reopening.assume_energised(now + seconds) is expected
 
 
 @asynccontextmanager

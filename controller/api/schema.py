@@ -1,9 +1,14 @@
 """Data types that messages of the API share; every number's key carries its unit."""
 
+import ast
+import inspect
 import re
-from typing import Annotated, Any, Literal, TypeAlias
+from itertools import pairwise
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from drivers.host.status_reports import ReportKind
 
@@ -93,13 +98,6 @@ Epoch: TypeAlias = Annotated[
 ]
 
 
-def _join_lines(schema: dict[str, Any]) -> None:
-    """Put each field's description in a JSON schema on one line."""
-    for field in schema.get("properties", {}).values():
-        if "description" in field:
-            field["description"] = one_line(field["description"])
-
-
 def one_line(text: str) -> str:
     """Return text of several lines on one line."""
     return " ".join(text.split())
@@ -111,14 +109,40 @@ class ApiMessage(BaseModel):
     The text below a field is its description in the schema.
     """
 
-    model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        frozen=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
-        json_schema_extra=_join_lines,
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Return the schema with the descriptions of the fields."""
+        reference = handler(core_schema)
+        schema = handler.resolve_ref_schema(reference)
+        for name, description in cls.descriptions().items():
+            schema["properties"][name]["description"] = description
+        return reference
+
+    @classmethod
+    def descriptions(cls) -> dict[str, str]:
+        """Return the descriptions of the fields by name, read from the source of the class.
+
+        pydantic can read them when it makes the class, but that would delay every command.
+        """
+        descriptions = {}
+        messages = [base for base in cls.__mro__ if issubclass(base, ApiMessage)]
+        for message in reversed(messages):
+            definition = ast.parse(inspect.getsource(message)).body[0]
+            for field, text in pairwise(cast(ast.ClassDef, definition).body):
+                match field, text:
+                    case (
+                        ast.AnnAssign(target=ast.Name(id=name)),
+                        ast.Expr(value=ast.Constant(value=str(description))),
+                    ):
+                        descriptions[name] = one_line(description)
+        for name, info in cls.model_fields.items():
+            if info.description is not None:
+                descriptions[name] = info.description
+        return descriptions
 
 
 class Empty(ApiMessage):

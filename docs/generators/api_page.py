@@ -5,7 +5,7 @@ from typing import Any
 
 from controller.api.jsonrpc import ERROR_MEANINGS
 from controller.api.methods import METHODS, TOPICS, EventParams, Method
-from controller.api.schema import ApiMessage, one_line
+from controller.api.schema import ApiMessage
 from controller.api.summaries import SUMMARIES
 from message_types import Models, Notation, each_model
 
@@ -54,12 +54,13 @@ def _notes(method: Method) -> Iterator[str]:
 
 def _rows(prefix: str, model: type[ApiMessage], models: Models) -> Iterator[str]:
     """One row per field; collects the models that fields are made of."""
+    descriptions = model.descriptions()
     for name, field in model.model_fields.items():
         kind = _TYPES.type_of(field.rebuild_annotation(), models)
         optional = "" if field.is_required() else "optional"
         if prefix == "→ " and isinstance(field.default, float):
             optional += f", by default {field.default:g}"
-        notes = "; ".join(part for part in (one_line(field.description or ""), optional) if part)
+        notes = "; ".join(part for part in (descriptions.get(name), optional) if part)
         yield f"- {prefix}`{name}` ({kind}){notes and f': {notes}'}"
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from client_stub import registered
 from controller.api.methods import TOPICS
-from controller.api.schema import one_line
 from message_types import Models, Notation, each_model
 
 _ROOT = Path(__file__).parents[2]
@@ -62,9 +61,10 @@ def _interface(name: str, summary: str) -> Iterator[str]:
 
 
 def _fields(name: str, models: Models) -> Iterator[str]:
+    descriptions = models[name].descriptions()
     for key, field in models[name].model_fields.items():
-        if field.description:
-            yield f"  /** {one_line(field.description)} */"
+        if key in descriptions:
+            yield f"  /** {descriptions[key]} */"
         optional = "" if field.is_required() else "?"
         yield f"  {key}{optional}: {_TYPES.type_of(field.rebuild_annotation(), models)};"
 

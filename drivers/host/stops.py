@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from drivers.host.line import Line
 from drivers.host.requests import Member, Priority
-from drivers.protocol.definition import LATCHED, QUANTITIES
+from drivers.protocol.definition import LATCHED, QUANTITIES, REPLY_TIMEOUT
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 from registry import threads
@@ -84,6 +84,9 @@ class StoppableAmplifier(Member, Protocol):
     def read_status(self, priority: Priority) -> "asyncio.Future[Values]":
         """Read the status."""
 
+    async def identify(self, *, timeout: float) -> Values:
+        """Read identity and capabilities, and return the status; timeout: for each reply [s]."""
+
 
 @dataclass(eq=False, slots=True)
 class PendingStop:
@@ -153,17 +156,30 @@ class PendingStop:
         """Await a request, and statuses until one confirms the stop or shows that it cannot.
 
         A status confirms it if its state is latched, its latch is newer than each one seen before,
-        and the levels of all channels are zero. Any other status may be old and only late.
+        and the levels of all channels are zero. Any other status may be old and only late. An older
+        latch can also show a power-up, after which latches count from 1: the amplifier is then
+        identified again, and the next request is compared with its new latch.
         """
         request = self._queued
         self._queued = None
         status = await (request or self._request())
+        if _is_restarted(status, self._latch):
+            await self.amplifier.identify(timeout=REPLY_TIMEOUT)
+            return False
         while _is_stopping(status, self._latch):
             if self.amplifier.is_silent(status):
                 return True
             await asyncio.sleep(CONFIRM_INTERVAL)
             status = await self.amplifier.read_status(Priority.STOP)
         return False
+
+
+def _is_restarted(status: Values, last_latch: int | None) -> bool:
+    """Whether a status shows a stop, but an older latch than was known."""
+    latch = status["latch"]
+    if last_latch is None or status["state"] not in LATCHED or latch == last_latch:
+        return False
+    return not is_newer_token(latch, last_latch)
 
 
 def _is_stopping(status: Values, last_latch: int | None) -> bool:

@@ -89,7 +89,7 @@ struct amplifier {
 void amplifier_init(struct amplifier *amplifier, const char *serial_number,
                     amplifier_notify *notify);
 
-// As without supply: silent at once and disarmed; faults and latch are remembered.
+// As without supply: immediately silent and disarmed, latch 0; the list of faults is kept.
 void amplifier_restart(struct amplifier *amplifier);
 
 // Make the next sample of every channel, and let one sample's time pass.

@@ -58,7 +58,7 @@ void amplifier_restart(struct amplifier *amplifier)
     intake_drop(&amplifier->intake);
     timer_stop(&amplifier->fed);
     amplifier_steer(amplifier, 0);
-    amplifier->committed = amplifier->session = 0;
+    amplifier->committed = amplifier->session = amplifier->latch = 0;
     amplifier->high_voltage = amplifier->is_limited = false;
     amplifier->fault = FAULT_NONE;
     enter(amplifier, SWITCH_ON_DISABLED, NO_CHANNEL);

@@ -382,12 +382,13 @@ class SimulatedAmplifier:
             self._handle_overtemperature(moment)
 
     def restart(self, moment: float) -> None:
-        """Power-cycle: immediately silent, disarmed, without sets and without a fault.
+        """Power-cycle: immediately silent and disarmed, without sets, fault and latch.
 
-        The latch and the fault history are kept.
+        The fault history is kept.
         """
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = "NONE"
+        self.latch = 0
         self._start()
         self.clock.restart(moment)
         self._enter("SWITCH_ON_DISABLED", moment)

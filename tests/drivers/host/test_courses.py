@@ -462,7 +462,6 @@ class OnLines(Taken):
         (line, *_), far = self.lines, self.far.a
         far.capabilities = {**far.capabilities, **capabilities}
         far.restart(line.loop.time())
-        far.latch = 0
         if line.kind is KINDS["can"]:
             line.boot(1)
 

@@ -340,7 +340,7 @@ async def _expect_interval(client: CanClient, interval: int, command: str) -> No
 
 
 async def _expect_reset(subject: Subject, client: CanClient) -> None:
-    """Require that reset_node restores defaults, and forgets the session."""
+    """Require that reset_node restores defaults, and forgets the session and the latch."""
     await _write_object(client, _HEARTBEAT, _INTERVAL.to_bytes(2, "little"))
     client.frames.clear()
     await client.command("reset_node")
@@ -352,9 +352,10 @@ async def _expect_reset(subject: Subject, client: CanClient) -> None:
     await client.command("start")
     reply = await client.exchange(_STATUS, ())
     status = STATUS.unpack(reply.words, is_strict=False)
-    actual = name_of(STATES, status["state"]), any(status["levels"]), status["token"]
-    expected_status = "SWITCH_ON_DISABLED", False, 0
-    expect_equal(actual, expected_status, "state, levels, token after reset_node")
+    state = name_of(STATES, status["state"])
+    actual = state, any(status["levels"]), status["token"], status["latch"]
+    expected_status = "SWITCH_ON_DISABLED", False, 0, 0
+    expect_equal(actual, expected_status, "state, levels, token, latch after reset_node")
     await _expect_interval(client, _DEFAULT_INTERVAL, "reset_node")
     values = subject.filled({"watchdog": subject.can["watchdog_max"]})
     arm = await client.exchange(MESSAGES["Arm"].number, MESSAGES["Arm"].request.pack(values))

@@ -12,9 +12,8 @@ import math
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,13 +23,13 @@ from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegrad
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.host.stops import StopOutcome
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
     FAULTS,
     HEARTBEAT,
     MESSAGES,
+    STATES,
     VERSION,
     loss_detection_time,
 )
@@ -38,7 +37,6 @@ from drivers.urls import ADDRESS
 from drivers.wires.serial_frames import Frame, encode_frame
 from drivers.wires.serial_line import SerialWire
 from kit.clock import VirtualLoop, in_virtual_time
-from kit.courses import Taken, courses, follow
 from kit.plates import TWO_AMPLIFIERS, make_paper_rig, write_rig
 from kit.wires import (
     LIMITS,
@@ -49,7 +47,6 @@ from kit.wires import (
     far_side,
     layer,
     make_bench,
-    on_amplifiers,
     on_two_amplifiers,
     rig_on_wire,
 )
@@ -198,60 +195,123 @@ async def test_broadcast_commit_starts_all_at_one_moment(
         await rig.group.disarm()
 
 
-@dataclass(kw_only=True)
-class OnARig(Taken):
-    """The amplifiers of a rig on a wire; stopped: what the last stop confirmed, begun at since."""
-
-    rig: HostedRig
-    stopped: Mapping[str, StopOutcome] = field(default_factory=dict)
-    since: float = 0.0
-
-    @property
-    def hosts(self) -> SimpleNamespace:
-        """What the host has of the amplifiers, by name."""
-        return SimpleNamespace(**self.rig.group.amplifiers)
-
-    def injects(self, of: str, **window: Any) -> None:
-        """Let a fault of an amplifier begin."""
-        self.rig.devices[of].inject_fault(FaultWindow(**window))
-
-    async def plays(self, level: float) -> None:
-        """Play 110 Hz at a level on the first channel of all."""
-        await self.rig.group.apply(
-            {name: [layer((0, 110.0, level))] for name in self.rig.group.amplifiers}
-        )
-
-    async def beats(self, seconds: float) -> None:
-        """Feed the watchdogs for a time."""
-        await self.rig.beat_until(threads.now() + seconds)
-
-    async def stops(self) -> None:
-        """Stop all."""
-        self.since = threads.now()
-        self.stopped = await self.rig.group.stop()
+async def play_on_all(rig: HostedRig, level: float) -> None:
+    """Play 110 Hz at a level on the first channel of every amplifier."""
+    played = [layer((0, 110.0, level))]
+    await rig.group.apply(dict.fromkeys(rig.group.amplifiers, played))
 
 
-@asynccontextmanager
-async def on_a_rig(*names: str, wire: str, speed: int = 0) -> AsyncIterator[OnARig]:
-    """The paper's plate on a wire at a speed; names: of several amplifiers that share it."""
-    rig, kind = make_paper_rig(12, 9), (SHARED_WIRES if names else WIRES)[wire]
-    rig = on_amplifiers(rig, names) if names else rig
-    at_speed = replace(kind, speed=speed or SPEEDS.get(kind.kind))
-    async with rig_on_wire(rig, at_speed, watchdog=2.0 if speed else WATCHDOG) as hosted:
-        yield OnARig(rig=hosted)
+ALLOWED_STATES = {STATES["FAULT"], STATES["QUICK_STOP_ACTIVE"]}
+SILENCING_FAULTS = {
+    "over_voltage": "OVER_VOLTAGE",
+    "arc": "ARC",
+    "over_current": "OVER_CURRENT",
+    "channel": "CHANNEL",
+    "over_temperature": "OVER_TEMPERATURE",
+    "interlock": "INTERLOCK",
+    "hang": "WATCHDOG",
+    "nak_storm": "WATCHDOG",
+    "unplug": "WATCHDOG",
+    "reboot": "NONE",
+}
+"""The fault that a status shows after a simulated fault."""
 
 
-COURSES = courses(Path(__file__).with_name("courses.yaml"))
+@pytest.mark.parametrize("kind", SILENCING_FAULTS)
+@in_virtual_time
+async def test_fault_silences_an_amplifier_until_it_is_cleared(
+    coarse_rig: Rig, wire: SimulatedWire, kind: FaultKind
+) -> None:
+    """The fault lasts a second; the host stops, finds the amplifier again, and plays."""
+    async with rig_on_wire(coarse_rig, wire) as rig:
+        await rig.group.arm()
+        await play_on_all(rig, 1.0)
+        await rig.beat_until(threads.now() + 0.2)
+        assert rig.levels("main")[0] == 1.0
+
+        fault(rig, kind, lasts=1.0)
+        with pytest.raises(DriverError):
+            await rig.beat_until(threads.now() + 2.0)
+        assert not rig.group.is_armed
+        await asyncio.sleep(0.3)
+        assert not any(rig.levels("main"))
+        await asyncio.sleep(1.0)
+        await rig.reopen(within=5.0)
+
+        status = rig.group.amplifiers["main"].status
+        assert status["fault"] == FAULTS[SILENCING_FAULTS[kind]]
+        restarted = {STATES["SWITCH_ON_DISABLED"]} if kind == "reboot" else set()
+        assert status["state"] in ALLOWED_STATES | restarted
+        await rig.group.clear()
+        await rig.group.arm()
+        await play_on_all(rig, 0.5)
+        await rig.group.disarm()
+
+
+@pytest.mark.parametrize("wire", ["can+slcan", "can+socketcand"], indirect=True)
+@in_virtual_time
+async def test_can_node_does_not_reply_after_a_restart_until_it_is_identified(
+    coarse_rig: Rig, wire: SimulatedWire
+) -> None:
+    """A restarted node has lost its network state and its heartbeats."""
+    async with rig_on_wire(coarse_rig, wire) as rig:
+        main = rig.group.amplifiers["main"]
+        fault(rig, "reboot", lasts=0.2)
+        await asyncio.sleep(0.3)
+
+        with pytest.raises(LinkError):
+            await main.read_status()
+
+        await main.identify()
+        await main.read_status()
+        assert main.status["state"] == STATES["SWITCH_ON_DISABLED"]
+
+
+@pytest.mark.parametrize("shared_wire", SHARED_WIRES)
+@in_virtual_time
+async def test_stop_silences_the_other_amplifier_of_a_line_while_one_hangs(
+    coarse_rig: Rig, shared_wire: str
+) -> None:
+    """West is silent within 50 ms of the stop, and east after its watchdog."""
+    shared = SHARED_WIRES[shared_wire]
+    shared = replace(shared, speed=SPEEDS.get(shared.kind))
+    async with rig_on_wire(on_two_amplifiers(coarse_rig), shared) as rig:
+        await rig.group.arm()
+        await play_on_all(rig, 0.5)
+        rig.devices["east"].inject_fault(FaultWindow(fault="hang"))
+
+        began = threads.now()
+        stopping = asyncio.create_task(rig.group.stop())
+        await asyncio.sleep(0.05)
+        assert not any(rig.levels("west"))
+        assert rig.levels("east")[0] == 0.5
+        outcomes = await stopping
+
+        assert outcomes["west"].is_confirmed
+        assert not outcomes["east"].is_confirmed
+        assert outcomes["east"].may_play_until > began
+        await asyncio.sleep(0.3)
+        assert not any(rig.levels("east"))
 
 
 @pytest.mark.parametrize(
-    ("name", "wire"),
-    [(name, wire) for name, each in COURSES.items() for wire in each.get("wires", WIRES)],
+    ("kind", "shortest", "longest"),
+    [("serial", 0.0479, 0.1158), ("modbus+rtu", 0.0527, 0.1254)],
 )
-def test_rig_keeps_to_its_course(name: str, wire: str) -> None:
-    """Every step is as it is in the file, on every wire that it names, or on all."""
-    course = {key: value for key, value in COURSES[name].items() if key != "wires"}
-    follow({**course, "wire": wire}, on_a_rig)
+@in_virtual_time
+async def test_status_takes_the_time_of_its_bytes_on_a_slow_line(
+    kind: str, shortest: float, longest: float
+) -> None:
+    """At 9600 baud, from an amplifier of four channels.
+
+    Request and reply have 23 words, of bytes of 10 or 11 bits, and 8 to 9 further bytes each.
+    """
+    slow = replace(WIRES[kind], speed=9600)
+    async with rig_on_wire(make_paper_rig(12, 9), slow, watchdog=2.0) as rig:
+        began = threads.now()
+        await rig.group.amplifiers["main"].read_status()
+
+        assert shortest <= threads.now() - began <= longest
 
 
 def line_to(device: AmplifierDevice) -> Line:

@@ -1,7 +1,7 @@
 """The curved glass of examples/calculix by the equations of CalculiX, with ERAs and fingers on it.
 
 CalculiX stores its stiffness and mass (SOLVER=MATRIXSTORAGE). At each frequency the whole system is
-factorised; forces act along the normals of the lower face of the glass at ERAs, and of the upper
+factorized; forces act along the normals of the lower face of the glass at ERAs, and of the upper
 one at fingers. Plates that deviate have modes that deviate: what each known mode adds is exchanged,
 and what all others add is scaled.
 """

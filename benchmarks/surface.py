@@ -88,7 +88,7 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
         highest = multiple * rig.limits.frequency_max
         with tempfile.TemporaryDirectory() as folder:
             surface = build_table(_as_surface(rig, highest, Path(folder)), drive_mode="phased")
-        fields, others = (each.unit_fields(own.cell_centres) for each in (own, surface))
+        fields, others = (each.unit_fields(own.cell_centers) for each in (own, surface))
         off = np.linalg.norm(others - fields, axis=-1) / np.linalg.norm(fields, axis=-1)
         promised, kept = list[list[float]](), list[list[float]]()
         rng = np.random.default_rng(1)
@@ -111,7 +111,7 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
         shares = 100 * np.mean(kept, axis=0)
         rows.append(
             f"| {multiple:g} times the highest frequency | {100 * off.max():.0f} % "
-            f"| {100 * off.mean():.1f} % | {100 * surface.discretisation_error.mean():.1f} % "
+            f"| {100 * off.mean():.1f} % | {100 * surface.discretization_error.mean():.1f} % "
             f"| {by_plate:.1f} | {by_surface:.1f} | {shares[0]:.0f} % | {shares[1]:.0f} % |"
         )
         print(rows[-1], flush=True)
@@ -139,9 +139,9 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
             rig = load_rig(file)
             frequencies = np.linspace(60.0, 400.0, FREQUENCIES)
             table = build_table(rig, frequencies=frequencies, drive_mode="phased")
-            on = on or GlassOnEras(glass, rig, frequencies, _places_on(rig), table.cell_centres)
+            on = on or GlassOnEras(glass, rig, frequencies, _places_on(rig), table.cell_centers)
             fields = on.fields
-            off = np.linalg.norm(table.unit_fields(table.cell_centres) - fields, axis=-1)
+            off = np.linalg.norm(table.unit_fields(table.cell_centers) - fields, axis=-1)
             off /= np.linalg.norm(fields, axis=-1)
             is_good = is_good and (multiple < 2.5 or float(off.mean()) < 0.03)
             for drive_mode in ("switched", "phased"):
@@ -174,7 +174,7 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
                 rows.append(
                     f"| {multiple:g} times the highest frequency{sampled} | {drive_mode} "
                     f"| {100 * off.max():.0f} % | {100 * off.mean():.1f} % "
-                    f"| {100 * table.discretisation_error.mean():.1f} % | "
+                    f"| {100 * table.discretization_error.mean():.1f} % | "
                     f"{' | '.join(f'{each:.1f}' for each in typical)} | {kept:.0f} % |"
                 )
                 print(rows[-1], flush=True)

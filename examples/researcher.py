@@ -161,8 +161,8 @@ study = {}
 for drive_mode in ("switched", "phased"):
     promises = []
     for distance in distances:
-        neighbour = (target[0] + distance, target[1])
-        answer = era.query(table, target, quiet=[neighbour], drive_mode=drive_mode)
+        neighbor = (target[0] + distance, target[1])
+        answer = era.query(table, target, quiet=[neighbor], drive_mode=drive_mode)
         promises.append(answer.fingers[0].promised_contrast_db)
     study[drive_mode] = np.array(promises)
 print("distance / cm", 100 * distances)

@@ -341,7 +341,7 @@ def search_by(forms: Forms, method: LawsonMethod) -> CoherentResult:
         diagonal = R.reshape(f, -1)[:, :: n + 1]
         diagonal *= 1 + np.float32(method.variance)
         diagonal += multipliers
-        weights, bound_of_step, factors = _optimise_targets(R, forms.targets, factors, method.gain)
+        weights, bound_of_step, factors = _optimize_targets(R, forms.targets, factors, method.gain)
         bound = np.minimum(bound, bound_of_step)
         if method.is_limited:
             gain = LEVEL_RESERVE * forms.gain_to_level(weights)
@@ -413,7 +413,7 @@ def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:
     return (shares[:, None] @ parts)[:, 0].view(np.complex64).reshape(n, eras, eras)
 
 
-def _optimise_targets(
+def _optimize_targets(
     R: Complex64Array, targets: Complex64Array, start: Complex64Array | None, gain: float
 ) -> tuple[Complex64Array, Float32Array, Complex64Array]:
     """Find weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).

@@ -142,17 +142,17 @@ move before its pattern changes (docs/concepts/people.md).
 
 
 def fingertips_on(
-    centres: FloatArray, *, length: float, width: float, rule: DiscRule = FINE_POINTS
+    centers: FloatArray, *, length: float, width: float, rule: DiscRule = FINE_POINTS
 ) -> tuple[FloatArray, FloatArray]:
     """Return points (k, p, 2) [m] under fingertips centered at (k, 2) [m], and weights (..., k, p).
 
     The weighted sum over a fingertip's points is the mean over its disc, or over the part of it
     that is on the plate. All points are on the plate and under the fingertip.
     """
-    low = -centres / FINGERTIP_RADIUS
-    high = ([length, width] - centres) / FINGERTIP_RADIUS
+    low = -centers / FINGERTIP_RADIUS
+    high = ([length, width] - centers) / FINGERTIP_RADIUS
     points, weights = rule.cut(low, high)
-    return centres[:, None] + FINGERTIP_RADIUS * points, weights
+    return centers[:, None] + FINGERTIP_RADIUS * points, weights
 
 
 def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
@@ -193,7 +193,7 @@ class Grid:
         """Number of cells."""
         return self.nx * self.ny
 
-    def centres(self, plate: Plate) -> FloatArray:
+    def centers(self, plate: Plate) -> FloatArray:
         """Return the centers (cell_count, 2) of the cells [m]."""
         x = (np.arange(self.nx) + 0.5) * plate.length / self.nx
         y = (np.arange(self.ny) + 0.5) * plate.width / self.ny

@@ -217,12 +217,12 @@ def touch(
 
 def _check_on_plate(path: Sequence["Point"], *, length: float, width: float) -> None:
     """Raise InputError for points outside the plate, which the daemon would only count."""
-    from model.config.units import in_metres
+    from model.config.units import in_meters
 
     for x, y in path:
         if 0 <= x <= length and 0 <= y <= width:
             continue
-        remedy = in_metres(x, y, length=length, width=width)
+        remedy = in_meters(x, y, length=length, width=width)
         remedy = remedy or "; coordinates start at its south-west corner"
         raise InputError(
             f"era touch must be on the plate of {length:g} m by {width:g} m, "

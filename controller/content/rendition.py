@@ -180,8 +180,8 @@ def _separated(
     for transient in sorted(transients, key=attrgetter("intensity"), reverse=True):
         time = transient.time
         index = bisect_left(times, time)
-        neighbours = times[max(index - 1, 0) : index + 1]
-        is_close = any(abs(time - near) < CLICKS_APART - _ROUNDING for near in neighbours)
+        neighbors = times[max(index - 1, 0) : index + 1]
+        is_close = any(abs(time - near) < CLICKS_APART - _ROUNDING for near in neighbors)
         if transient.intensity > 0 and not is_close:
             separate.insert(index, transient)
             times.insert(index, time)
@@ -194,9 +194,9 @@ def _clicks(
 ) -> tuple[Tap, ...]:
     """Return the clicks of transients; level_db_sl: level of intensity 1."""
     levels = _levels_of(transients, level_db_sl).tolist()
-    centres = hertz_of(np.array([transient.sharpness for transient in transients])).tolist()
+    centers = hertz_of(np.array([transient.sharpness for transient in transients])).tolist()
     clicks = []
-    for transient, level, hertz in zip(transients, levels, centres, strict=True):
+    for transient, level, hertz in zip(transients, levels, centers, strict=True):
         clicks.append(Tap(transient.time, level, _band(hertz, frequencies)))
     return tuple(clicks)
 
@@ -278,9 +278,9 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
     order = np.argsort(hertz, kind="stable")
     ascending = hertz[order]
     energy_below = np.append(0.0, np.cumsum(energy[order]))
-    centres = np.geomspace(MIN_HZ, MAX_HZ, 60)
-    first = np.searchsorted(ascending, (1 - _BAND) * centres)
-    end = np.searchsorted(ascending, (1 + _BAND) * centres, side="right")
+    centers = np.geomspace(MIN_HZ, MAX_HZ, 60)
+    first = np.searchsorted(ascending, (1 - _BAND) * centers)
+    end = np.searchsorted(ascending, (1 + _BAND) * centers, side="right")
     best = best_of(energy_below[end] - energy_below[first])
     in_band = order[first[best] : end[best]]
     return float(np.average(hertz[in_band], weights=energy[in_band]))

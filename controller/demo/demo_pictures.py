@@ -126,9 +126,9 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     level = row.levels_db_sl.get(row.target_id)
     draw_fingertip(axes, target, felt=True, level_db_sl=level, others=quiet)
     for id, position in row.quiet.items():
-        neighbours = [target, *(tip for tip in quiet if tip != position)]
+        neighbors = [target, *(tip for tip in quiet if tip != position)]
         level = row.levels_db_sl.get(id)
-        draw_fingertip(axes, position, felt=False, level_db_sl=level, others=neighbours)
+        draw_fingertip(axes, position, felt=False, level_db_sl=level, others=neighbors)
     contrast = row.measured_contrast_db
     promised = row.promised_contrast_db
     title = "single finger" if contrast is None else f"contrast {contrast:.1f} dB"

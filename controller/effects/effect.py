@@ -65,7 +65,7 @@ class Region:
         }
 
 
-NEIGHBOURS: Literal["neighbours"] = "neighbours"
+NEIGHBORS: Literal["neighbours"] = "neighbours"
 """Level name: as strong as the neighbors allow."""
 
 MIN_DB_SL = -20.0
@@ -87,7 +87,7 @@ Modulation: TypeAlias = (
 )
 """Frequency [Hz] at which a vibration comes and goes; None for a steady one."""
 
-Level: TypeAlias = Annotated[float | Literal["neighbours"], replace(DB_SL, word=NEIGHBOURS)]
+Level: TypeAlias = Annotated[float | Literal["neighbours"], replace(DB_SL, word=NEIGHBORS)]
 """dB above the detection threshold, or `neighbours`."""
 
 

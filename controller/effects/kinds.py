@@ -189,17 +189,17 @@ class Dial(Effect):
         self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
     ) -> EffectRun:
         """Start halfway between two detents."""
-        return _DialRun(self, None if region is None else region.shape.centre, level_db_sl)
+        return _DialRun(self, None if region is None else region.shape.center, level_db_sl)
 
 
 class _DialRun(EffectRun):
     """Clicks by the angle of one finger around a center; none without a center."""
 
     def __init__(
-        self, dial: Dial, centre: tuple[float, float] | None, level_db_sl: float | None
+        self, dial: Dial, center: tuple[float, float] | None, level_db_sl: float | None
     ) -> None:
         self._dial = dial
-        self._centre = centre
+        self._center = center
         self._level = level_db_sl
         self._angle = 0.0  # [rad], including full turns
         self._last_direction: float | None = None  # [rad] within one turn; None if unknown
@@ -207,11 +207,11 @@ class _DialRun(EffectRun):
 
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return a click after each passed notch."""
-        if self._centre is None:
+        if self._center is None:
             return NoStimulus()
-        centre_x, centre_y = self._centre
-        x = contact.x - centre_x
-        y = contact.y - centre_y
+        center_x, center_y = self._center
+        x = contact.x - center_x
+        y = contact.y - center_y
         radius = math.hypot(x, y)
         if radius < _CENTRE_RADIUS:
             self._last_direction = None  # the finger can leave the center at any angle

@@ -296,10 +296,10 @@ def _is_worth_it(goal: Answer, present: Answer, playing: _Voices, changes: _Voic
     return gain >= required_gain and not _is_weaker(goal, present)
 
 
-def _is_apart(content: Content, neighbours: Iterable[Content]) -> bool:
+def _is_apart(content: Content, neighbors: Iterable[Content]) -> bool:
     """Whether a content is at least 30 Hz from all others."""
     frequency = content.frequency or 0.0
-    distances = [abs(frequency - (neighbour.frequency or 0.0)) for neighbour in neighbours]
+    distances = [abs(frequency - (neighbor.frequency or 0.0)) for neighbor in neighbors]
     return min(distances, default=APART_HZ) >= APART_HZ
 
 

@@ -25,7 +25,7 @@ FADED_AFTER = 0.05
 """Time [s] from the end of a pulse or layer until it has faded on every amplifier."""
 
 MAX_DB_SL = 26.0
-"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
+"""Upper bound of `as strongly as the neighbors allow`: twice a strong vibration."""
 
 NO_CONTACTS = "no contact on the plate"
 
@@ -88,7 +88,7 @@ class Target:
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
-    """Level if the plate allows it; None for as strong as the neighbours allow."""
+    """Level if the plate allows it; None for as strong as the neighbors allow."""
     pulse: Pulse | None = None
     """Limits its duration; None for a vibration without an end of its own."""
     band: Band | None = None

@@ -70,7 +70,7 @@ SHORT_OF = 1.0
 
 LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
 
-NEIGHBOURS_LEAVE_NOTHING = (
+NEIGHBORS_LEAVE_NOTHING = (
     "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it does "
     "not; lift or move that finger away"
 )
@@ -412,7 +412,7 @@ def _why_unfelt(sensation: Sensation) -> str | None:
     if sensation.layer is None or stimulus is None:
         return None
     if stimulus.is_limit and sensation.level_db_sl <= 0:
-        return NEIGHBOURS_LEAVE_NOTHING
+        return NEIGHBORS_LEAVE_NOTHING
     if own_level_db_sl(sensation) < 0 <= stimulus.level_db_sl:
         return LIMITS_LEAVE_NOTHING
     return None
@@ -499,14 +499,14 @@ def with_paths(
         path = _path_of(contact, now, plate)
         if path is None:
             continue
-        neighbours = [neighbour for neighbour in (*moved, *ends) if neighbour is not finger]
-        if _comes_near(path, neighbours):
+        neighbors = [neighbor for neighbor in (*moved, *ends) if neighbor is not finger]
+        if _comes_near(path, neighbors):
             continue
         start, middle, end = path
         moved[number] = replace(finger, at=middle)
         has_room = len(moved) + len(ends) + 2 <= MAX_CONTACTS
         is_long = len({start, middle, end}) == len(path)  # not at the plate's edge
-        if has_room and is_long and _is_steady_and_alone(finger, neighbours):
+        if has_room and is_long and _is_steady_and_alone(finger, neighbors):
             stimulus = _named(finger, number)
             at_end = replace(finger, load=MIN_LOAD, sharing=MUST, stimulus=stimulus)
             ends.append(replace(at_end, at=start))
@@ -543,11 +543,11 @@ def _on_plate(position: Point, plate: Plate) -> Point:
     return x_on_plate, y_on_plate
 
 
-def _comes_near(path: Sequence[Point], neighbours: Sequence[Finger]) -> bool:
+def _comes_near(path: Sequence[Point], neighbors: Sequence[Finger]) -> bool:
     """Whether a path comes within a fingertip's radius of another finger."""
     for point in path:
-        for neighbour in neighbours:
-            if math.dist(point, neighbour.at) < FINGERTIP_RADIUS:
+        for neighbor in neighbors:
+            if math.dist(point, neighbor.at) < FINGERTIP_RADIUS:
                 return True
     return False
 
@@ -559,13 +559,13 @@ def _named(finger: Finger, number: int) -> Stimulus | None:
     return replace(finger.stimulus, name=finger.name or f"finger {number}")
 
 
-def _is_steady_and_alone(finger: Finger, neighbours: Sequence[Finger]) -> bool:
+def _is_steady_and_alone(finger: Finger, neighbors: Sequence[Finger]) -> bool:
     """Whether a finger feels nothing, or a steady content that no other finger may share."""
     if finger.stimulus is None:
         return True
     if finger.stimulus.modulation_hz is not None:
         return False
-    return not any(finger.may_feel_one_with(neighbour) for neighbour in neighbours)
+    return not any(finger.may_feel_one_with(neighbor) for neighbor in neighbors)
 
 
 def _on_paths(table: LocalizationTable, solution: Answer, count: int) -> Answer:

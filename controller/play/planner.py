@@ -417,8 +417,8 @@ class Planner:
         self._count_clocks(clock_errors)
         table = self._selector.chooser.table
         self._timing.prepare(table.frequencies.tolist())
-        centre = (table.plate.length / 2, table.plate.width / 2)
-        placement = Placement((centre,), ((0.0, 0.0),))
+        center = (table.plate.length / 2, table.plate.width / 2)
+        placement = Placement((center,), ((0.0, 0.0),))
         band = self.capabilities.limits.frequencies
         pattern = query(table, placement, MIN_LEVEL_DB_SL, drive_mode=drive_mode, band_hz=band)
         (layer,) = pattern.layers

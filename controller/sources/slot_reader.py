@@ -170,7 +170,7 @@ class SlotReader:
 def light_press(resolutions: Mapping[int, int], stated: Mapping[int, float]) -> LightPress:
     """Return the values of a panel's axes under a finger that presses lightly.
 
-    resolutions: by axis, in units per millimetre, or units per gram for a pressure; 0 or missing if
+    resolutions: by axis, in units per millimeter, or units per gram for a pressure; 0 or missing if
     the panel does not state it. A pressure without resolution has an arbitrary unit (the kernel's
     input-event-codes.rst); a contact size without resolution has the unit of positions. stated:
     values from the URL by axis, which take precedence; 0 disables an axis.

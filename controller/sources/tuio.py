@@ -34,7 +34,7 @@ _Key: TypeAlias = tuple[str, int]
 _KeyPair: TypeAlias = tuple[_Key, _Key]
 """Keys of a contact's cursor and blob; the same key twice for a contact that has only one."""
 
-_NEAR = 0.02  # of the sensor: a cursor this close to the centre of a small blob is the same contact
+_NEAR = 0.02  # of the sensor: a cursor this close to the center of a small blob is the same contact
 _PARTED = 4.0  # at this multiple of the distance they separate again; fast movement stays below it
 _APART_IDS = 1 << 32  # added to the id of a contact with a duplicate id, above all ids of senders
 
@@ -212,7 +212,7 @@ def _blobs_of_cursors(
 
 
 def _relative_distance(cursor: Touch, blob: Touch) -> float:
-    """Return the distance of a cursor from the centre of a blob, relative to the blob's radius."""
+    """Return the distance of a cursor from the center of a blob, relative to the blob's radius."""
     radius = max(_NEAR, min(blob.size or (0.0,)) / 2)
     return math.dist((cursor.x, cursor.y), (blob.x, blob.y)) / radius
 

@@ -207,9 +207,9 @@ class ClockReadings:
         if min(sure_residuals) > FAR / 2:
             del self._kept[:-RECENT]
         error = max(fit.error, min(residuals))
-        self.fit = self._centred(fit._replace(error=error), lowest_lead)
+        self.fit = self._centered(fit._replace(error=error), lowest_lead)
 
-    def _centred(self, fit: LeadFit, lowest_lead: float) -> LeadFit:
+    def _centered(self, fit: LeadFit, lowest_lead: float) -> LeadFit:
         """Return a fit, in the middle of the gap if a few readings are far below most others.
 
         Either most readings are late, or the few are wrong; the error includes half the gap.

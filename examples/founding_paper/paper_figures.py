@@ -177,7 +177,7 @@ def equal_area_points(plate: Plate) -> FloatArray:
     wavelength = plate.bending_wavelength(float(SWEEP[-1]))
     size = min(max(plate.length, plate.width) / 24, wavelength / 12)
     grid = Grid(max(1, round(plate.length / size)), max(1, round(plate.width / size)))
-    return grid.centres(plate)
+    return grid.centers(plate)
 
 
 def _same_frequency(rig: Rig, free: FreePlate) -> PaperFigure:

@@ -194,13 +194,13 @@ def concentration(table: LocalizationTable, layer: Layer, placement: Placement) 
     for target in contacts:
         _, disc_amplitudes = amplitudes_at(fingertip_points(*target, plate))
         felt.append(disc_amplitudes.sum(axis=0) @ fingertip_weights(*target, plate))
-    points = cell_centres(plate)
+    points = cell_centers(plate)
     frequencies, amplitudes = amplitudes_at(points)
     near = ~is_beyond(points, contacts)
     return concentration_of(frequencies, amplitudes, near, felt=min(felt), plate=plate)
 
 
-def cell_centres(plate: Plate) -> FloatArray:
+def cell_centers(plate: Plate) -> FloatArray:
     """Return the centers (p, 2) [m] of small equal cells that tile the plate."""
     return lattice(_cell_middles(plate.length), _cell_middles(plate.width))
 
@@ -219,7 +219,7 @@ def concentration_of(
     felt: float,
     plate: Plate,
 ) -> Concentration:
-    """Evaluate a vibration with amplitudes (f, p) [m/s²] at `cell_centres`, frequencies (f,) [Hz].
+    """Evaluate a vibration with amplitudes (f, p) [m/s²] at `cell_centers`, frequencies (f,) [Hz].
 
     near (p,): centers within 50 mm of a target; felt [m/s²]: mean amplitude at the least driven
     target. Energy is kinetic, for uniform mass. If all centers are near, contrast is relative to

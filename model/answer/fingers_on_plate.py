@@ -84,16 +84,16 @@ class FingersOnPlate:
             tips = read_fingertips(table, places)
         else:
             tips = table.raster.fingertips(np.array(places), table.shapes)
-        centres = tips.few[:, 0]
-        finger_count = len(centres)
+        centers = tips.few[:, 0]
+        finger_count = len(centers)
 
         def touched(plate_on_eras: PlateOnEras) -> TouchedPlate:
             if by_kernel:
-                return touch(plate_on_eras, centres, loads, table.clocks)
+                return touch(plate_on_eras, centers, loads, table.clocks)
             plate = plate_on_eras.plate
             stiffness = plate.finger_stiffness(finger_count, loads)
             load_std = plate.load_stds(finger_count, loads)
-            return TouchedPlate(plate_on_eras, centres, stiffness, load_std, table.clocks)
+            return TouchedPlate(plate_on_eras, centers, stiffness, load_std, table.clocks)
 
         has_harmonics = table.uncertainty.harmonic > 0
         at_harmonics = touched(table.at_harmonics) if has_harmonics else None

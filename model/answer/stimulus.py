@@ -14,7 +14,7 @@ import numpy as np
 
 from model.answer.envelope import Course
 from model.arrays import Point
-from model.config.units import in_metres
+from model.config.units import in_meters
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
 from model.structure.attachments import check_loads
@@ -285,7 +285,7 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
         if not (0 <= x <= length and 0 <= y <= width):  # False for NaN
             raise InputError(
                 f"{what} must be on the plate, from (0, 0) to ({length:g}, {width:g}) m, got "
-                f"({x:g}, {y:g}) m{in_metres(x, y, length=length, width=width)}"
+                f"({x:g}, {y:g}) m{in_meters(x, y, length=length, width=width)}"
             )
         if not plate.contains(x, y):
             raise InputError(f"{what} must be within the outline, got ({x:g}, {y:g}) m")

@@ -107,7 +107,7 @@ class _Candidates:
 
 
 @dataclass(frozen=True, eq=False)
-class _Judgement:
+class _Judgment:
     """Levels of m candidates on d drawn plates.
 
     Scaled to the contents' levels if there are several contents.
@@ -134,13 +134,13 @@ def choose_by_numpy(
         candidates = _coherent_candidates(fingers, contents, ringing)
     else:
         candidates = _switched_candidates(fingers, contents, ringing[0])
-    judgement = _judged(fingers, contents, candidates, ringing)
+    judgment = _judged(fingers, contents, candidates, ringing)
     best = np.zeros(1, dtype=int)
     is_apart = True
     if len(contents.streams) > 1:
-        best, is_apart = best_combination(table, contents, candidates, judgement)
+        best, is_apart = best_combination(table, contents, candidates, judgment)
     elif len(candidates.drives) > 1:
-        best[0] = best_tone(contents, candidates.scores, judgement)
+        best[0] = best_tone(contents, candidates.scores, judgment)
     tones = DriveTones.of([candidates.drives[number] for number in best.tolist()])
     return promised(fingers, contents, tones, is_apart=is_apart, ringing=ringing)
 
@@ -175,7 +175,7 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     points = fingers.tips.few
     weights = fingers.tips.few_weights
     if len(others) > MAX_FINGERS_BY_POINT:
-        points = touched.centres[:, None]
+        points = touched.centers[:, None]
         weights = np.ones_like(weights[:, :1])
     shares = np.zeros_like(weights)
     shares[others] = weights[others] / np.float32(len(others))
@@ -401,7 +401,7 @@ def _judged(
     contents: Contents,
     candidates: _Candidates,
     ringing: Sequence[RingingUnderFingers | None],
-) -> _Judgement:
+) -> _Judgment:
     """Evaluate candidates on drawn plates."""
     drives = list[WeightedTones]()
     for number, drive in zip(candidates.contents.tolist(), candidates.drives, strict=True):
@@ -432,7 +432,7 @@ def _judged(
             gain = contents.levels[number] / np.maximum(least[indices], _TINY)
             own[indices] *= gain[:, None]
             loudest[indices] *= gain[:, None, None] ** 2
-    return _Judgement(least, own[:, 1:], loudest[:, :, 1:])
+    return _Judgment(least, own[:, 1:], loudest[:, :, 1:])
 
 
 def _felt_in_batches(
@@ -472,21 +472,21 @@ def _judged_in_time(
     return own * gains[:, None], powers
 
 
-def best_tone(contents: Contents, scores: FloatArray, judgement: _Judgement) -> int:
+def best_tone(contents: Contents, scores: FloatArray, judgment: _Judgment) -> int:
     """Choose the candidate of a single content: level first, then contrast.
 
     Without other fingers, the score (m,) counts, and equally a level that varies little among
     plates.
     """
     level = float(contents.levels[0])
-    reaches = judgement.least >= level * REACHED
+    reaches = judgment.least >= level * REACHED
     if not reaches.any():
         reaches[:] = True
     if not contents.quiet:
-        steadiness = judgement.least / percentile(judgement.own, 50)
+        steadiness = judgment.least / percentile(judgment.own, 50)
         return best_of(reaches * scores * steadiness)
-    foreign_power = judgement.loudest[:, [*contents.quiet]].max(axis=1)
-    contrast = judgement.own / np.maximum(np.sqrt(foreign_power), 1e-30)
+    foreign_power = judgment.loudest[:, [*contents.quiet]].max(axis=1)
+    contrast = judgment.own / np.maximum(np.sqrt(foreign_power), 1e-30)
     return best_of(np.where(reaches, percentile(contrast), 0.0))
 
 
@@ -494,7 +494,7 @@ def best_combination(
     table: LocalizationTable,
     contents: Contents,
     candidates: _Candidates,
-    judgement: _Judgement,
+    judgment: _Judgment,
 ) -> tuple[IntArray, bool]:
     """Choose a candidate for each content (K,); also return whether their frequencies are apart.
 
@@ -515,8 +515,8 @@ def best_combination(
                     combinations,
                     streams,
                     contents.quiet,
-                    judgement.own[:, ::PRUNING_STEP],
-                    judgement.loudest[:, :, ::PRUNING_STEP],
+                    judgment.own[:, ::PRUNING_STEP],
+                    judgment.loudest[:, :, ::PRUNING_STEP],
                     sensitivities,
                 )
                 combinations = combinations[best_few(worst, contents.combinations)]
@@ -525,8 +525,8 @@ def best_combination(
                 combinations,
                 streams,
                 contents.quiet,
-                judgement.own,
-                judgement.loudest,
+                judgment.own,
+                judgment.loudest,
                 sensitivities,
             )
             return combinations[best_of(worst)], min_distance == contents.apart_hz

@@ -96,7 +96,7 @@ def build(
     with Stopwatch() as timed, progress_bar("parts") as progress:
         table = solve_table(problem, drive_mode=drive_mode, workers=workers, progress=progress)
     save_table(table, output)
-    error = 100 * float(table.discretisation_error.max())
+    error = 100 * float(table.discretization_error.max())
     if rig.plate.surface is None:
         mesh_row = (
             f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
@@ -137,7 +137,7 @@ def _mesh_warning(table: "LocalizationTable") -> str | None:
     """Return a warning if the fields of a table have large errors, else None."""
     from model.structure.surface import WELL_KNOWN
 
-    error = 100 * float(table.discretisation_error.max())
+    error = 100 * float(table.discretization_error.max())
     if error < _COARSE_ERROR:
         return None
     if table.plate.surface is None:

@@ -167,7 +167,7 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
     if listed:
         yield "\nweak cells: center, contrast to the other finger: median, 10th percentile"
         for (x, y), median, tenth in zip(
-            cells.centres[cells.weak],
+            cells.centers[cells.weak],
             cells.median_db[cells.weak],
             cells.tenth_db[cells.weak],
             strict=True,

@@ -52,7 +52,7 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
         weights[i] = is_other[i / p] ? share / (float)others : 0;
     }
     const grouped all = {.groups = 1, .p = k * p, .others = by->others, .gain_variance = by->gain_variance,
-                         .ridge = by->ridge, .points = is_coarse ? on->centres : of->few_points, .weights = weights,
+                         .ridge = by->ridge, .points = is_coarse ? on->centers : of->few_points, .weights = weights,
                          .error = by->search_error, .shares = by->shares};
     formed found = new_forms(on, &all, memory);
     best reached = {.weights = values(memory, n), .score = ZERO.re, .missed = ZERO.re, .bound = ZERO.re};

@@ -295,7 +295,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     const size_t contents = given->contents, k = given->fingers;
     const tips at = read_tips(read, given->places, k, memory);
     plates on = *table;
-    on.k = given->fingers, on.centres = at.centres, on.stiffness = given->stiffness, on.load_std = given->load_std;
+    on.k = given->fingers, on.centers = at.centers, on.stiffness = given->stiffness, on.load_std = given->load_std;
     question of = {.contents = given->contents, .bands = given->bands, .quiet_count = given->quiet_count,
                    .candidates = given->candidates, .combinations = given->combinations, .apart = given->apart,
                    .level = given->level, .background = given->background, .judging = given->judging,
@@ -308,7 +308,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     plates twice;
     if (by->at_harmonics) {
         twice = *by->at_harmonics;
-        twice.k = given->fingers, twice.centres = at.centres, twice.stiffness = given->at_harmonics;
+        twice.k = given->fingers, twice.centers = at.centers, twice.stiffness = given->at_harmonics;
         twice.load_std = given->load_std;
         of.harmonics = (distortion){.on = &twice, .threshold = by->harmonic_threshold, .points = at.few,
                                     .weights = at.few_weights, .few = read->few};

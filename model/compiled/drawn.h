@@ -100,8 +100,8 @@ SHARED void find_at_nodes(tones *to, const float *weights, arena *memory) {
         for (size_t s = 0; s < r; s++) {
             value sum = ZERO, own = ZERO;
             for (size_t i = 0; i < k; i++) {
-                own.re += held[i].re * on->centres[i * r + s];
-                own.im += held[i].im * on->centres[i * r + s];
+                own.re += held[i].re * on->centers[i * r + s];
+                own.im += held[i].im * on->centers[i * r + s];
             }
             for (size_t j = 0; j < b; j++) sum = add_product(sum, forces[j], of.T[j * r + s]);
             modal[s] = subtract_product(sum, own, of.g[s]);
@@ -153,13 +153,13 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
     for (size_t s = 0; s < r; s++) {
         value sum = ZERO;
         for (size_t j = 0; j < a; j++) {
-            lanes shape = filled(j < b ? on->shapes[j * r + s] : on->centres[(j - b) * r + s]);
+            lanes shape = filled(j < b ? on->shapes[j * r + s] : on->centers[(j - b) * r + s]);
             sum.re += held[j].re * shape, sum.im += held[j].im * shape;
         }
         lost[s] = times(by_loss[s], sum);
     }
     for (size_t j = 0; j < a; j++) {
-        const float *shape = j < b ? on->shapes + j * r : on->centres + (j - b) * r;
+        const float *shape = j < b ? on->shapes + j * r : on->centers + (j - b) * r;
         value sum = ZERO, by = j < b ? attached[j] : of->D[j - b];
         for (size_t s = 0; s < r; s++) sum.re += lost[s].re * shape[s], sum.im += lost[s].im * shape[s];
         loss[j] = subtract_product(ZERO, by, sum);

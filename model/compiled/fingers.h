@@ -12,7 +12,7 @@ typedef struct {
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
     const float *by_damping, *by_stiffness;                /* (f, n), (f, off) */
     const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
-    const float *centres, *stiffness, *load_std;           /* (k, r); (f, k) D; (k) standard deviation of its logarithm */
+    const float *centers, *stiffness, *load_std;           /* (k, r); (f, k) D; (k) standard deviation of its logarithm */
     value *of_blocks; /* (blocks of LANES frequencies, first thicknesses, b, r) T, as loaded by `load` */
 } plates;
 
@@ -74,7 +74,7 @@ INLINE void by_fingers(value *restrict G, const float *points, size_t p, const v
     const size_t k = on->k, r = on->r;
     value *modal = of->row + on->b + k;
     for (size_t j = 0; j < k; j++) {
-        for (size_t s = 0; s < r; s++) modal[s] = scaled(of->g[s], filled(on->centres[j * r + s]));
+        for (size_t s = 0; s < r; s++) modal[s] = scaled(of->g[s], filled(on->centers[j * r + s]));
         multiply_into(G + j, k, points, modal, p, r);
     }
     if (X) by_eras(G, p, X, of, on);
@@ -131,8 +131,8 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
     to->T = of_block(on, rows, cases);
     if (!to->T) load(work, on->by_force, (size_t)on->b * on->r, cases), to->T = work;
     load(to->g, on->receptance, on->r, cases);
-    multiply(to->at, on->centres, to->T, on->k, on->r, on->b);
-    by_fingers(to->G, on->centres, on->k, NULL, to, on);
+    multiply(to->at, on->centers, to->T, on->k, on->r, on->b);
+    by_fingers(to->G, on->centers, on->k, NULL, to, on);
     couple(to, on, rows, cases);
     return end;
 }
@@ -142,15 +142,15 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
 SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, size_t each, const touched *of,
                       const plates *on, value *room) {
     const size_t b = on->b, k = on->k;
-    const value *X = of->at, *G = of->G; /* at the fingers' centres */
-    if (points != on->centres || p != k) {
+    const value *X = of->at, *G = of->G; /* at the fingers' centers */
+    if (points != on->centers || p != k) {
         value *of_eras = room, *of_fingers = room + p * b;
         const size_t r = on->r;
         for (size_t first = 0, next; first < p; first = next) {
             size_t finger = 0;
             next = first + each;
-            while (finger < k && memcmp(points + first * r, on->centres + finger * r, r * sizeof(float))) finger++;
-            if (finger < k) { /* the first point is the finger's centre, which is computed already */
+            while (finger < k && memcmp(points + first * r, on->centers + finger * r, r * sizeof(float))) finger++;
+            if (finger < k) { /* the first point is the finger's center, which is computed already */
                 memcpy(of_eras + first * b, of->at + finger * b, b * sizeof(value));
                 memcpy(of_fingers + first * k, of->G + finger * k, k * sizeof(value));
                 first++;

@@ -14,12 +14,12 @@ typedef struct {
 } raster;
 
 typedef struct {
-    float *few, *fine, *few_weights, *fine_weights, *centres; /* (k, few, r), (k, fine, r), (k, few), (k, fine), (k, r) */
+    float *few, *fine, *few_weights, *fine_weights, *centers; /* (k, few, r), (k, fine, r), (k, few), (k, fine), (k, r) */
 } tips;
 
 INLINE double within(double a, double low, double high) { return a < low ? low : a > high ? high : a; }
 
-/* Compute the centroid of the part of the unit disc inside a rectangle that contains its centre. */
+/* Compute the centroid of the part of the unit disc inside a rectangle that contains its center. */
 SHARED void centroid_of(double *to, const double *low, const double *high, const raster *on) {
     const double bottom = fmax(low[1], -1), top = fmin(high[1], 1);
     const double first = asin(fmax(low[0], -1)), last = asin(fmin(high[0], 1));
@@ -77,14 +77,14 @@ INLINE void lagrange(float *to, double x, int count) {
     }
 }
 
-/* Return the shapes under fingertips centred at places (k, 2) [m], and the weights of their points in the mean over a
+/* Return the shapes under fingertips centered at places (k, 2) [m], and the weights of their points in the mean over a
  * fingertip. */
 SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *memory) {
     const size_t r = on->r, few = on->few, fine = on->fine, count = few + fine, patch = on->side_x * on->side_y;
     const size_t half = patch / 2, padded = (r + LANES - 1) / LANES * LANES;
     tips to = {.few = floats(memory, k * few * r), .fine = floats(memory, k * fine * r),
                .few_weights = floats(memory, k * few), .fine_weights = floats(memory, k * fine),
-               .centres = floats(memory, k * r)};
+               .centers = floats(memory, k * r)};
     const arena mark = *memory;
     float *near = floats(memory, patch * padded), *share = floats(memory, patch), *found = floats(memory, padded);
     float *along_x = floats(memory, on->side_x), *along_y = floats(memory, on->side_y);
@@ -92,14 +92,14 @@ SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *m
     char *is_kept = take(memory, count);
     memset(near, 0, patch * padded * sizeof(float));
     for (size_t finger = 0; finger < k; finger++) {
-        const double *centre = places + 2 * finger, size[2] = {on->length, on->width};
+        const double *center = places + 2 * finger, size[2] = {on->length, on->width};
         const int points[2] = {on->nx, on->ny}, side[2] = {on->side_x, on->side_y};
         double low[2], high[2], spacing[2];
         int start[2], is_cut = 0;
         for (int axis = 0; axis < 2; axis++) {
-            low[axis] = -centre[axis] / on->radius, high[axis] = (size[axis] - centre[axis]) / on->radius;
+            low[axis] = -center[axis] / on->radius, high[axis] = (size[axis] - center[axis]) / on->radius;
             spacing[axis] = size[axis] / (points[axis] - 1);
-            start[axis] = (int)within(rint(centre[axis] / spacing[axis] - (side[axis] - 1) / 2.0), 0, points[axis] - side[axis]);
+            start[axis] = (int)within(rint(center[axis] / spacing[axis] - (side[axis] - 1) / 2.0), 0, points[axis] - side[axis]);
         }
         for (size_t i = 0; i < count; i++) {
             for (int axis = 0; axis < 2; axis++) inside[2 * i + axis] = within(on->points[2 * i + axis], low[axis], high[axis]);
@@ -120,8 +120,8 @@ SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *m
                 memcpy(near + (y * side[0] + x) * padded, on->shapes + ((start[1] + y) * on->nx + start[0] + x) * r,
                        r * sizeof(float));
         for (size_t i = 0; i < count; i++) {
-            lagrange(along_x, (centre[0] + on->radius * inside[2 * i]) / spacing[0] - start[0], side[0]);
-            lagrange(along_y, (centre[1] + on->radius * inside[2 * i + 1]) / spacing[1] - start[1], side[1]);
+            lagrange(along_x, (center[0] + on->radius * inside[2 * i]) / spacing[0] - start[0], side[0]);
+            lagrange(along_y, (center[1] + on->radius * inside[2 * i + 1]) / spacing[1] - start[1], side[1]);
             for (int y = 0; y < side[1]; y++)
                 for (int x = 0; x < side[0]; x++) share[y * side[0] + x] = along_y[y] * along_x[x];
             for (size_t at = 0; at < padded; at += LANES) {
@@ -140,7 +140,7 @@ SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *m
             memcpy(i < few ? to.few + (finger * few + i) * r : to.fine + (finger * fine + i - few) * r, found,
                    r * sizeof(float));
         }
-        memcpy(to.centres + finger * r, to.few + finger * few * r, r * sizeof(float));
+        memcpy(to.centers + finger * r, to.few + finger * few * r, r * sizeof(float));
     }
     release(memory, mark);
     return to;

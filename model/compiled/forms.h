@@ -50,7 +50,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     value *strokes = values(memory, n), *by_damping = values(memory, n), *by_stiffness = values(memory, off);
     value *damped = values(memory, n * n), *changes = values(memory, j * n);
     value *X = values(memory, (parts * p + j) * n), *R = to->power, *U = to->uncertain;
-    value *modelled = values(memory, n * n);
+    value *modeled = values(memory, n * n);
     lanes *error = take(memory, n * sizeof(lanes)), *shares = take(memory, n * n * sizeof(lanes));
     put_fingers(&now, on, rows, cases, space);
     load(drives, on->drives, n, rows);
@@ -128,17 +128,17 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
             share = root(share);
             for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
         }
-        gram(modelled, X, counted, n);
+        gram(modeled, X, counted, n);
         gram(form, X + counted * n, (parts - 1) * counted + j, n);
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++) {
-                form[u * n + v].re += modelled[u * n + v].re;
-                form[u * n + v].im += modelled[u * n + v].im;
+                form[u * n + v].re += modeled[u * n + v].re;
+                form[u * n + v].im += modeled[u * n + v].im;
             }
         for (size_t u = 0; of->shares && u < n; u++) /* clock errors of amplifiers */
             for (size_t v = u; v < n; v++) {
-                form[u * n + v].re += shares[u * n + v] * modelled[u * n + v].re;
-                form[u * n + v].im += shares[u * n + v] * modelled[u * n + v].im;
+                form[u * n + v].re += shares[u * n + v] * modeled[u * n + v].re;
+                form[u * n + v].im += shares[u * n + v] * modeled[u * n + v].im;
             }
         lanes trace = {0};
         for (size_t e = 0; e < n; e++) {
@@ -156,7 +156,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
         value *rest = U + group * n * n;
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++) {
-                value own = form[u * n + v], without = modelled[u * n + v];
+                value own = form[u * n + v], without = modeled[u * n + v];
                 rest[u * n + v] = (value){.re = own.re - without.re, .im = own.im - without.im};
                 rest[v * n + u] = (value){.re = own.re - without.re, .im = without.im - own.im};
             }

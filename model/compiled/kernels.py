@@ -63,7 +63,7 @@ class TouchedPlates(Structure):
     _fields_ = [
         *_fields(i="n b k r t off rows lanes kept"),
         *_fields(p="receptance by_force coupling moved minus_omega2 forces strokes by_damping"),
-        *_fields(p="by_stiffness by_loss attached shapes centres stiffness load_std of_blocks"),
+        *_fields(p="by_stiffness by_loss attached shapes centers stiffness load_std of_blocks"),
     ]
 
 

@@ -246,9 +246,9 @@ SHARED void gram(value *restrict R, const value *X, size_t rows, size_t n) {
     for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, 1);
 }
 
-/* Factorise a positive definite Hermitian R (n, n) in place, from its upper triangle. The inverse of each pivot is
+/* Factorize a positive definite Hermitian R (n, n) in place, from its upper triangle. The inverse of each pivot is
  * stored as the imaginary part of the diagonal. */
-SHARED void factorise(value *restrict R, size_t n) {
+SHARED void factorize_hermitian(value *restrict R, size_t n) {
     for (size_t s = 0; s < n; s++) {
         const value *from = R + s * n;
         const lanes pivot = inverse(from[s].re);
@@ -260,8 +260,8 @@ SHARED void factorise(value *restrict R, size_t n) {
     }
 }
 
-/* x = R^-1 x with R from `factorise`. */
-SHARED void solve_factorised(value *restrict x, const value *restrict R, size_t n) {
+/* x = R^-1 x with R from `factorize_hermitian`. */
+SHARED void solve_hermitian(value *restrict x, const value *restrict R, size_t n) {
     for (size_t s = 0; s < n; s++)
         for (size_t u = s + 1; u < n; u++) {
             const value from = R[s * n + u];

@@ -43,13 +43,13 @@ SHARED void at_points(float *found, size_t each, const float *coordinates, size_
 
 INLINE size_t padded_to(size_t points) { return (points + LANES - 1) / LANES * LANES; }
 
-/* Return the shapes at points (points, r) and then at the fingers' centres as columns (r, padded). */
+/* Return the shapes at points (points, r) and then at the fingers' centers as columns (r, padded). */
 SHARED float *columns_of(const float *rows, size_t points, const plates *on, arena *memory) {
     const size_t r = on->r, every = points + on->k, padded = padded_to(every);
     float *found = floats(memory, r * padded);
     for (size_t j = 0; j < r; j++)
         for (size_t i = 0; i < padded; i++)
-            found[j * padded + i] = i < points ? rows[i * r + j] : i < every ? on->centres[(i - points) * r + j] : 0;
+            found[j * padded + i] = i < points ? rows[i * r + j] : i < every ? on->centers[(i - points) * r + j] : 0;
     return found;
 }
 
@@ -95,7 +95,7 @@ SHARED void put_fingers_at_points(touched *to, float *found, size_t each, const 
     for (size_t i = 0; i < k; i++) {
         for (size_t l = 0; l < count; l++)
             for (size_t s = 0; s < 2 * r; s++)
-                modal[2 * r * l + s] = on->receptance[2 * r * cases[l] + s] * on->centres[i * r + s / 2];
+                modal[2 * r * l + s] = on->receptance[2 * r * cases[l] + s] * on->centers[i * r + s / 2];
         at_points(found + 2 * padded * (b + i), each, modal, count, columns, padded, r);
     }
     for (size_t l = 0; l < LANES; l++) {

@@ -176,11 +176,11 @@ SHARED lanes least_power(value *restrict w, value *restrict R, value *restrict b
     value *columns = values(memory, targets * n), *gram = values(memory, targets * targets);
     value *factor = values(memory, targets);
     lanes highest = {0};
-    factorise(R, n);
+    factorize_hermitian(R, n);
     for (size_t t = 0; t < targets; t++) {
         value *column = columns + t * n;
         for (size_t u = 0; u < n; u++) column[u].re = on->target[t * n + u].re, column[u].im = -on->target[t * n + u].im;
-        solve_factorised(column, R, n);
+        solve_hermitian(column, R, n);
         for (size_t u = 0; u <= t; u++) {
             const value found = field(on->target + u * n, column, n);
             gram[u * targets + t] = found;

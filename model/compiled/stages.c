@@ -85,7 +85,7 @@ static int done(void (*run)(const job *, arena *), job each) {
     return status;
 }
 
-/* Compute `tips`, without the centres, for fingertips at places (count, 2) [m]. */
+/* Compute `tips`, without the centers, for fingertips at places (count, 2) [m]. */
 int fingertips_stage(const raster *on, const double *places, int count, void *few, void *fine, void *few_weights,
                      void *fine_weights) {
     return done(run_fingertips, (job){.on = on, .by = places, .count = count,

@@ -377,7 +377,7 @@ class Rectangle:
         return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
 
     @property
-    def centre(self) -> _Point:
+    def center(self) -> _Point:
         """The center of area."""
         return (self.x + self.width / 2, self.y + self.height / 2)
 
@@ -410,7 +410,7 @@ class Circle:
         return math.dist((x, y), (self.x, self.y)) <= self.radius
 
     @property
-    def centre(self) -> _Point:
+    def center(self) -> _Point:
         """The center of the circle."""
         return (self.x, self.y)
 
@@ -458,7 +458,7 @@ class Polygon:
         )
 
     @property
-    def centre(self) -> _Point:
+    def center(self) -> _Point:
         """Centroid, or the mean of the corners if crossing sides leave no area."""
         following = (*self.points[1:], self.points[0])
         cross = [
@@ -488,7 +488,7 @@ RegionShape: TypeAlias = Rectangle | Circle | Polygon
 
 
 def _is_on_side(x: float, y: float, start: _Point, end: _Point) -> bool:
-    """Return whether a point is on a side, within a nanometre."""
+    """Return whether a point is on a side, within a nanometer."""
     length = math.dist(start, end)
     if length == 0:
         return (x, y) == start

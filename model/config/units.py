@@ -221,7 +221,7 @@ def parse_point(text: str, *, what: str) -> tuple[float, float]:
     return x, y
 
 
-def in_metres(x: float, y: float, *, length: float, width: float) -> str:
+def in_meters(x: float, y: float, *, length: float, width: float) -> str:
     """Return the remedy for a position that would be on the plate in cm or mm, else "".
 
     length, width [m]: of the plate. Coordinates below 1 are not taken for another unit.

@@ -254,7 +254,7 @@ def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPla
     return replace(twice, forces=twice.forces * ratio, strokes=twice.strokes * ratio)
 
 
-MODELLED, THICKER, THINNER = 0, 1, 2
+MODELED, THICKER, THINNER = 0, 1, 2
 """Indices of the nominal thickness, and of the thicknesses one standard deviation above and
 below."""
 
@@ -346,7 +346,7 @@ class PlateOnEras:
     def fields(self) -> Complex64Array:
         """Acceleration of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
         plate = self.plate
-        return self.by_force[:, MODELLED, : plate.era_count] * plate.forces[:, :, None]
+        return self.by_force[:, MODELED, : plate.era_count] * plate.forces[:, :, None]
 
 
 def _eliminated(
@@ -379,8 +379,8 @@ def with_places(
     """
     plate = on.plate
     n = plate.era_count
-    deformation = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELLED, :n]
-    by_unit_force = np.linalg.norm(on.by_force[:, MODELLED, :n], axis=2)
+    deformation = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELED, :n]
+    by_unit_force = np.linalg.norm(on.by_force[:, MODELED, :n], axis=2)
     by_unit_stiffness = by_unit_force * np.linalg.norm(deformation, axis=2)
     changes = np.empty_like(by_unit_stiffness)
     field_errors = np.empty_like(by_unit_stiffness)
@@ -406,9 +406,9 @@ def _by_places(
     n = plate.era_count
     w2 = plate.minus_omega2[row]
     Z = plate.stiffness[row]
-    T = on.by_force[row, MODELLED]
-    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
-    free = on.receptance[row, MODELLED] * shifts
+    T = on.by_force[row, MODELED]
+    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELED, :n]
+    free = on.receptance[row, MODELED] * shifts
     held = ((free @ plate.shapes.T) * Z) @ T
     couples = np.asarray(w2 * free - held)  # (n, 2, r), by 1 N
     by_force = T[:n, None]

@@ -46,8 +46,8 @@ class TouchedByKernel(TouchedPlate):
     def structure(self) -> TouchedPlates:
         """The plate as kernels read it."""
         structure = TouchedPlates.from_buffer_copy(plates_structure(self.plate_on_eras))
-        structure.k = len(self.centres)
-        structure.point(centres=self.centres, stiffness=self.stiffness, load_std=self.load_std)
+        structure.k = len(self.centers)
+        structure.point(centers=self.centers, stiffness=self.stiffness, load_std=self.load_std)
         return structure
 
     def forms(
@@ -133,7 +133,7 @@ class TouchedByKernel(TouchedPlate):
 
 def touch(
     plate_on_eras: PlateOnEras,
-    centres: Float32Array,
+    centers: Float32Array,
     loads: tuple[float, ...] = (),
     clocks: ClockErrors = EXACT_CLOCKS,
 ) -> TouchedPlate:
@@ -144,12 +144,12 @@ def touch(
     """
     library = kernels()
     plate = plate_on_eras.plate
-    finger_count = len(centres)
+    finger_count = len(centers)
     stiffness = plate.finger_stiffness(finger_count, loads)
     load_std = plate.load_stds(finger_count, loads)
     if library is None or not finger_count:
-        return TouchedPlate(plate_on_eras, centres, stiffness, load_std, clocks)
-    return TouchedByKernel(plate_on_eras, centres, stiffness, load_std, clocks, kernels=library)
+        return TouchedPlate(plate_on_eras, centers, stiffness, load_std, clocks)
+    return TouchedByKernel(plate_on_eras, centers, stiffness, load_std, clocks, kernels=library)
 
 
 def plates_structure(plate_on_eras: PlateOnEras) -> TouchedPlates:

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.ensemble.attached_plate import MODELLED, THICKER, THINNER, PlateOnEras
+from model.ensemble.attached_plate import MODELED, THICKER, THINNER, PlateOnEras
 from model.ensemble.draws import (
     EXACT_CLOCKS,
     ClockErrors,
@@ -103,9 +103,9 @@ class DrawnPlates:
         """Draw plates with a number of fingers."""
         plate = plate_on_eras.plate
         uncertainty = plate.uncertainty
-        first_thickness = plate_on_eras.first.get(drawing.thicknesses, MODELLED)
+        first_thickness = plate_on_eras.first.get(drawing.thicknesses, MODELED)
         thickness_count = drawing.thicknesses if first_thickness else 1
-        first_base = plate_on_eras.first.get(drawing.bases, MODELLED)
+        first_base = plate_on_eras.first.get(drawing.bases, MODELED)
         base_count = drawing.bases if first_base else 1
         draws = draw(
             plate.era_count,
@@ -155,7 +155,7 @@ class TouchedPlate:
     """A plate of every thickness with k fingers on it."""
 
     plate_on_eras: PlateOnEras
-    centres: Float32Array
+    centers: Float32Array
     """Mode shapes (k, r) at the fingers."""
     stiffness: Complex64Array
     """Dynamic stiffness (f, k) of the fingers [N/m]."""
@@ -204,7 +204,7 @@ class TouchedPlate:
     def coordinates(self) -> Complex64Array:
         """Reduced coordinates by each ERA at full stroke at all frequencies, (f, n, r)."""
         rows = np.arange(len(self.stiffness))
-        nodes = np.full(len(rows), MODELLED)
+        nodes = np.full(len(rows), MODELED)
         return self._held(rows, nodes, self.plate_on_eras.fields)
 
     def forms(
@@ -222,10 +222,10 @@ class TouchedPlate:
         discretization error of each ERA's field at all frequencies of the plate.
         """
         plate = self.plate_on_eras.plate
-        modelled = np.full(len(rows), MODELLED)
+        modeled = np.full(len(rows), MODELED)
         by_group = (len(rows), *weights.shape, -1)
         all_points = points.reshape(-1, points.shape[2])
-        responses, motion = self.sources(rows, modelled, all_points)
+        responses, motion = self.sources(rows, modeled, all_points)
         deformation = self._deformation(rows, motion)
         fields = self._era_fields(rows, responses)
         changes = [self._changes_by_damping(rows, responses, deformation)]
@@ -244,7 +244,7 @@ class TouchedPlate:
         certain = gram(group_fields * np.sqrt(weights)[:, :, None])
         fine_fields = None
         if fine is not None:
-            fine_responses, _ = self.sources(rows, modelled, fine.reshape(-1, fine.shape[2]))
+            fine_responses, _ = self.sources(rows, modeled, fine.reshape(-1, fine.shape[2]))
             by_fine_group = (len(rows), *fine.shape[:2], -1)
             fine_fields = self._era_fields(rows, fine_responses).reshape(by_fine_group)
         return LoadedContacts(group_fields, fine_fields, power, power - certain)
@@ -295,7 +295,7 @@ class TouchedPlate:
         by_load = self.load_std * self.stiffness[rows]
         change_of_stiffness = np.concatenate([by_stiffness, by_load], axis=1)
         attachment_count = deformation.shape[1]
-        fingers = np.arange(attachment_count - len(self.centres), attachment_count)
+        fingers = np.arange(attachment_count - len(self.centers), attachment_count)
         uncertain = np.concatenate([np.arange(by_stiffness.shape[1]), fingers])
         forces = deformation[:, uncertain] * change_of_stiffness[:, :, None]
         response_power = power_of(responses[:, :, uncertain])
@@ -327,7 +327,7 @@ class TouchedPlate:
         by_load = self.load_std * self.stiffness[rows]
         own[:, mount_count:] = by_load * deformation[:, mount_count:]
 
-        shapes = np.concatenate([plate.shapes, self.centres])
+        shapes = np.concatenate([plate.shapes, self.centers])
         stiffness = np.concatenate([plate.stiffness[rows], self.stiffness[rows]], axis=1)
         forces = np.asarray(drives - stiffness * motion, dtype=np.complex64)
         by_loss = self.plate_on_eras.by_loss[rows, nodes]
@@ -375,7 +375,7 @@ class TouchedPlate:
     ) -> Complex64Array:
         """Fields (m, 1 + thicknesses, p) of tones on the nominal plate and at all thicknesses."""
         first = plates.first_thickness
-        nodes = np.array([MODELLED, *range(first, first + plates.thickness_count)])
+        nodes = np.array([MODELED, *range(first, first + plates.thickness_count)])
         fields = self.fields(
             rows.repeat(len(nodes)),
             np.tile(nodes, len(rows)),
@@ -456,18 +456,18 @@ class TouchedPlate:
     def _fingers(self, rows: IntArray, nodes: IntArray) -> _Fingers:
         """Return how the fingers hold the plate in cases of rows (c,) and nodes (c,)."""
         by_force = self.plate_on_eras.by_force[rows, nodes]
-        response = self.centres @ by_force.swapaxes(1, 2)
-        free = self.plate_on_eras.receptance[rows, nodes][:, None] * self.centres
+        response = self.centers @ by_force.swapaxes(1, 2)
+        free = self.plate_on_eras.receptance[rows, nodes][:, None] * self.centers
         coupled = (response @ self.plate_on_eras.coupling[rows, nodes]) @ by_force
         displacement = np.asarray(free + coupled, dtype=np.complex64)
         stiffness = self.stiffness[rows]
-        system = (self.centres @ displacement.swapaxes(1, 2)) * stiffness[:, None]
-        fingers = np.arange(len(self.centres))
+        system = (self.centers @ displacement.swapaxes(1, 2)) * stiffness[:, None]
+        fingers = np.arange(len(self.centers))
         system[:, fingers, fingers] += 1
         return _Fingers(stiffness, response, displacement, np.asarray(np.linalg.inv(system)))
 
     def _held(self, rows: IntArray, nodes: IntArray, free: Complex64Array) -> Complex64Array:
         """Return coordinates (c, q, r) with the fingers, from those without."""
         fingers = self._fingers(rows, nodes)
-        under_fingers = fingers.under_fingers(self.centres @ free.swapaxes(1, 2))
+        under_fingers = fingers.under_fingers(self.centers @ free.swapaxes(1, 2))
         return fingers.coordinates(free, under_fingers)

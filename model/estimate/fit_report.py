@@ -74,9 +74,9 @@ def change_rows(calibration: Calibration) -> list[str]:
     rows = list(map(_parameter_row, parameters, confused))
     for name, (position, error) in calibration.moved.items():
         era = plate.rig.era(name)
-        fitted = f"{_millimetres(position)} mm"
-        position_before = f"{_millimetres((era.x, era.y))} mm"
-        rows.append((f"{name} place", fitted, f"± {_millimetres(error)} mm", position_before, ""))
+        fitted = f"{_millimeters(position)} mm"
+        position_before = f"{_millimeters((era.x, era.y))} mm"
+        rows.append((f"{name} place", fitted, f"± {_millimeters(error)} mm", position_before, ""))
     return _table(rows)
 
 
@@ -98,7 +98,7 @@ def _parameter_row(parameter: Parameter, confused: str) -> _Row:
     return parameter.name, fitted, standard_error, value_before, ", ".join(notes)
 
 
-def _millimetres(point: Point) -> str:
+def _millimeters(point: Point) -> str:
     return f"({1e3 * point[0]:.1f}, {1e3 * point[1]:.1f})"
 
 

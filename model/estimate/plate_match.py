@@ -679,7 +679,7 @@ def _loads(match: Match) -> Sequence[Load]:
     """
     rig = match.plate.rig
     free = linearized(match)
-    points = _LOAD_GRID.centres(rig.plate)
+    points = _LOAD_GRID.centers(rig.plate)
     loads: list[Load] = []
     for number, mass in free.loads(points, std=rig.plate.mass)[:1]:
         x, y = points[number].tolist()

@@ -274,7 +274,7 @@ def sensed_plate(
     form = None
     if has_form:
         supports = footprints_of(rig.eras, rig.masses)
-        form = reduced_modes(free, supports, MASS_CELLS.centres(rig.plate))
+        form = reduced_modes(free, supports, MASS_CELLS.centers(rig.plate))
     space = space_from_datasheets(rig, (), None)
     return SensedPlate(rig, sensors, frequencies, space, free, form=form).with_rig(rig)
 

@@ -93,7 +93,7 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
     """Move positions in x (p,) that are on an edge of the plate inwards; by: relative to the prior.
 
     On an edge a position can vary in one direction only, so a start there would cover only half of
-    its neighbourhood.
+    its neighborhood.
     """
     moved = x.copy()
     for number in space.indices("place"):

@@ -200,7 +200,7 @@ def _fits_with_mass(
     start = inwards(space, x, by=_INWARDS)
     searched = space.uncertain & ~space.of("masses", "mode_shifts", "mode_losses")
     linear = fit(model, rough, searched=searched, start=start, evaluations=1)
-    points = _MASS_GRID.centres(model.rig.plate)
+    points = _MASS_GRID.centers(model.rig.plate)
     first = space.groups["masses"].start + 3 * number
     part = slice(first, first + 3)
     starts = [start]

@@ -125,7 +125,7 @@ def _cells_figure(
         axes.label_outer()
     rim = [withStroke(linewidth=3, foreground="black")]  # white alone is lost on yellow
     for axes, cells in zip(all_axes, crossed, strict=False):
-        centers = 100 * grid.centres(table.plate)[cells]
+        centers = 100 * grid.centers(table.plate)[cells]
         axes.plot(*centers.T, "x", color="white", ms=6, mew=1.5, path_effects=rim)
     figure.colorbar(image, ax=list(all_axes), label=label)
     return figure

@@ -53,7 +53,7 @@ _FIELDS = {
 }
 _IEEE_754 = b"2"  # floating-point format of a binary dataset 58
 _SI = 1  # units code of dataset 164
-_NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimeters, centimeters, inches
+_NOT_METERS = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimeters, centimeters, inches
 # Coordinate systems that are global, by dataset: mesh programs give the global one the number 1.
 _GLOBAL_SYSTEMS = {15: (0,), 2411: (0, 1)}
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
@@ -428,7 +428,7 @@ def units_of(path: Path, block: DatasetBlock) -> tuple[float, float]:
         raise InputError(f"{place}: units (dataset 164) must have a code and factors; export again")
     label = rows[0][10:30].decode("ascii", "replace").strip()
     length, force = factors[:2]
-    if not 0 < length < math.inf or (length == 1 and int(code[0]) in _NOT_METRES):
+    if not 0 < length < math.inf or (length == 1 and int(code[0]) in _NOT_METERS):
         raise InputError(
             f"{place}: length factor (dataset 164) must be positive and match units code "
             f"{int(code[0])} {label!r}, got {length:g}; export it in SI"

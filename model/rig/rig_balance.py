@@ -58,11 +58,11 @@ class RigBalance:
     def notes(self) -> Iterator[str]:
         """Yield warnings of a plate that tips over, nearly tips over, or lifts off a support."""
         balance = self._balance
-        centre = f"the center of mass, {_millimetres(balance.centre)},"
+        center = f"the center of mass, {_millimeters(balance.center)},"
         where = f"{'eras' if self._rests_on_eras else 'supports'}"
         if self.tips_over:
             yield (
-                f"{where}: {centre} is {-1e3 * balance.inside:.3g} mm outside {self._names}: the "
+                f"{where}: {center} is {-1e3 * balance.inside:.3g} mm outside {self._names}: the "
                 "plate tips over; move them apart, or add supports"
             )
             return
@@ -71,18 +71,18 @@ class RigBalance:
                 yield (
                     f"{where}.{name}: carries {load:.2g} N, so the plate lifts off it, or pulls at "
                     "it; move it toward the center of mass, at "
-                    f"{_millimetres(balance.centre)}, or make it softer"
+                    f"{_millimeters(balance.center)}, or make it softer"
                 )
         if balance.inside_share < _NEAR_EDGE:
             yield (
-                f"{where}: {centre} is only {1e3 * balance.inside:.2g} mm within {self._names}: "
+                f"{where}: {center} is only {1e3 * balance.inside:.2g} mm within {self._names}: "
                 "the plate nearly tips over; move them apart, or add supports"
             )
         tipping = self._tipping_touch()
         if tipping is not None and tipping[0] < TOUCH_FORCE:
             force, point = tipping
             yield (
-                f"{where}: a finger that presses with {force:.2g} N at {_millimetres(point)} tips "
+                f"{where}: a finger that presses with {force:.2g} N at {_millimeters(point)} tips "
                 f"the plate over; a firm touch has {TOUCH_FORCE:g} N: move {self._names} apart, or "
                 "add supports"
             )
@@ -93,7 +93,7 @@ class RigBalance:
         tipping = self._tipping_touch()
         return {
             "weight_n": balance.weight,
-            "centre_of_mass_m": [*balance.centre],
+            "centre_of_mass_m": [*balance.center],
             "static_loads_n": dict(self.loads),
             "inside_m": balance.inside,
             "tipping_force_n": None if tipping is None else tipping[0],
@@ -168,5 +168,5 @@ def _span(low: float, high: float) -> str:
     return first if first == last else f"{first} to {last}"
 
 
-def _millimetres(point: Point) -> str:
+def _millimeters(point: Point) -> str:
     return f"({1e3 * point[0]:.0f}, {1e3 * point[1]:.0f}) mm"

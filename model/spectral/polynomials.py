@@ -59,7 +59,7 @@ class EdgedFunctions:
     """Orthonormal functions of x in (0, length) [m], by parity: EVEN or ODD about the middle.
 
     Per parity: Legendre polynomials up to a degree, ascending, then boundary layers with these
-    decay constants [1/m] at both ends, orthogonalised.
+    decay constants [1/m] at both ends, orthogonalized.
     """
 
     length: float

@@ -28,7 +28,7 @@ class Balance:
 
     weight: float
     """Weight of the plate and everything that moves with it [N]."""
-    centre: Point
+    center: Point
     """Center of mass [m]."""
     supports: FloatArray
     """Positions of the supports (n, 2) [m]."""
@@ -46,7 +46,7 @@ class Balance:
     @property
     def inside(self) -> float:
         """Distance of the center of mass to the nearest edge [m], negative outside the hull."""
-        return float(np.min(-_distances(self.edges, self.centre)))
+        return float(np.min(-_distances(self.edges, self.center)))
 
     @property
     def inside_share(self) -> float:
@@ -56,7 +56,7 @@ class Balance:
         """
         edges = self.edges
         depths = np.max(-(self.supports @ edges[:, :2].T + edges[:, 2]), axis=0)
-        return float(np.min(-_distances(edges, self.centre) / depths))
+        return float(np.min(-_distances(edges, self.center) / depths))
 
     def tipping_force(self, points: Iterable[Point]) -> tuple[float, Point] | None:
         """Return the smallest force [N] on any given point [m] that tips the plate, and the point.
@@ -64,7 +64,7 @@ class Balance:
         None if no point is outside the hull. The center of mass must be within it.
         """
         edges = self.edges
-        holding = -self.weight * _distances(edges, self.centre)  # N m, about each edge
+        holding = -self.weight * _distances(edges, self.center)  # N m, about each edge
         smallest: tuple[float, Point] | None = None
         for point in points:
             levers = _distances(edges, point)
@@ -90,7 +90,7 @@ def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoa
     x, y = (masses @ positions / masses.sum()).tolist()
     return Balance(
         weight=GRAVITY * float(masses.sum()),
-        centre=(x, y),
+        center=(x, y),
         supports=np.array([(support.x, support.y) for support in springs]),
         loads=static_loads(plate, sources, loads=loads),
     )

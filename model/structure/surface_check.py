@@ -50,7 +50,7 @@ _SCALE_LIMIT, _EXPECTED_SCALE = 10.0, 3.0
 _RIGID_SCALE_LIMIT = 50.0
 """Limit for rigid-body modes; measured: 0.09 to 2.7 if the nodes cover a quarter of the part."""
 
-_NORMALISED_SCALE = 1.4
+_NORMALIZED_SCALE = 1.4
 """Limit for shapes that look normalized in another way; measured: 0.97 to 1.03 on even plates."""
 
 _SAME_VALUE = 5e-4  # relative difference after rounding to four digits
@@ -244,11 +244,11 @@ def _check_scale(shapes: SurfaceShapes, motion: _Motion, mass: float) -> Iterato
         "export shapes of unit modal mass, or modal masses with them, and check surface.mass and "
         "all units"
     )
-    normalisation = _normalisation(shapes.modes)
-    is_scaled = _is_near_one([typical, *of_rigid], _NORMALISED_SCALE)
-    if normalisation and not is_scaled:
+    normalization = _normalization(shapes.modes)
+    is_scaled = _is_near_one([typical, *of_rigid], _NORMALIZED_SCALE)
+    if normalization and not is_scaled:
         raise InputError(
-            f"shapes must be of unit modal mass, got shapes that look {normalisation}: {integral}; "
+            f"shapes must be of unit modal mass, got shapes that look {normalization}: {integral}; "
             f"{remedy}"
         )
     if not _is_near_one([typical], _SCALE_LIMIT):
@@ -279,7 +279,7 @@ def _is_near_one(values: Sequence[float], factor: float) -> bool:
     return all(1 / factor <= value <= factor for value in values)
 
 
-def _normalisation(modes: ModeShapes) -> str:
+def _normalization(modes: ModeShapes) -> str:
     """Describe a normalization other than to unit modal mass; empty if there is no sign of another.
 
     The common value of all modes is a power of ten, or its root if units of mass were converted.

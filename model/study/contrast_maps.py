@@ -90,7 +90,7 @@ def map_contrast(
     quiet_contacts = tuple(quiet)
     grid = grid or table.grid
     modes = tuple(map(checked_mode, drive_modes)) or (table.drive_mode,)
-    centers = grid.centres(table.plate)
+    centers = grid.centers(table.plate)
     questions: list[tuple[int, int, Placement]] = []
     for cell, (x, y) in enumerate(centers.tolist()):
         nearest = min(math.dist((x, y), contact) for contact in quiet_contacts)

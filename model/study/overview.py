@@ -101,7 +101,7 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
         "weak_share": float(weak.weak[is_known].mean()) if is_known.any() else None,
         **_summary_of_contrasts(overview.contrasts),
         "mesh_name": str(table.mesh),
-        "discretisation_error_percent": 100 * float(table.discretisation_error.max()),
+        "discretisation_error_percent": 100 * float(table.discretization_error.max()),
         "reference_mesh": str(table.reference_mesh),
         "raster": f"{table.raster.nx}x{table.raster.ny}",
         "code_version": table.code_version,

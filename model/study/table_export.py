@@ -90,7 +90,7 @@ def _mat_content(table: LocalizationTable) -> dict[str, Any]:
         **rig_values,
         "mesh": str(table.mesh),
         "reference_mesh": str(table.reference_mesh),
-        "discretisation_error": table.discretisation_error,
+        "discretisation_error": table.discretization_error,
         "frequency_hz": table.frequencies,
         "raster_x_m": table.raster.x,
         "raster_y_m": table.raster.y,
@@ -101,7 +101,7 @@ def _mat_content(table: LocalizationTable) -> dict[str, Any]:
         "mode_dispersion_rad2_s2": table.dispersion,
         "mode_shape": table.shapes,
         "mode_shape_attachments": table.attachment_shapes,
-        "cell_centre_m": table.cell_centres,
+        "cell_centre_m": table.cell_centers,
         "cells_along_x": float(table.grid.nx),
         "cells_along_y": float(table.grid.ny),
     }

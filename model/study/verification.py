@@ -285,7 +285,7 @@ def _check_content(
     count = min(SAMPLED_FREQUENCIES, len(table.frequencies))
     rows = np.sort(rng.choice(len(table.frequencies), count, replace=False))
     raster_points = table.raster.points[table.plate.covers(table.raster.points)]
-    points = np.concatenate([raster_points, table.cell_centres])
+    points = np.concatenate([raster_points, table.cell_centers])
     direct = respond(rig.eras, table.frequencies[rows], points, loads=rig.masses)
     direct = table.allowed_shares[rows, None, None] * direct
     direct_on_raster, direct_at_cells = np.split(direct, [len(raster_points)], axis=2)
@@ -297,7 +297,7 @@ def _check_content(
 
     interpolation_error = table.mesh.interpolation_error(rig.plate, float(table.frequencies[-1]))
     tolerance += RASTER_ERROR + interpolation_error
-    at_cells = table.unit_fields(table.cell_centres)[rows]
+    at_cells = table.unit_fields(table.cell_centers)[rows]
     error = _relative_error(at_cells, direct_at_cells)
     yield ContentCheck("fields at the cells", error, tolerance)
 
@@ -317,7 +317,7 @@ def _check_answer(
     fingers = fingertip_loads(rig.fingertip, placed.contacts, placed.loads)
     discs = [fingertip_points(*contact, rig.plate) for contact in placed.contacts]
     finger_points = np.concatenate(discs)
-    rms_points = _RMS_GRID.centres(rig.plate)
+    rms_points = _RMS_GRID.centers(rig.plate)
     rms_points = rms_points[rig.plate.covers(rms_points)]
     points = np.concatenate([finger_points, rms_points])
     frequencies, amplitudes = tone_fields(

@@ -66,7 +66,7 @@ class WeakCells:
     """
 
     grid: Grid
-    centres: FloatArray
+    centers: FloatArray
     """Centers (cells, 2) of the cells [m]."""
     median_db: FloatArray
     """Median (cells,) over other fingers."""
@@ -91,7 +91,7 @@ class WeakCells:
         """Return the map for programs; null where a contrast is not finite."""
         return {
             "grid": str(self.grid),
-            "centres_m": self.centres.tolist(),
+            "centres_m": self.centers.tolist(),
             "median_contrast_db": nullable(self.median_db),
             "tenth_percentile_contrast_db": nullable(self.tenth_db),
             "median_contrast_error_db": nullable(self.errors_db[0]),
@@ -121,7 +121,7 @@ def find_weak_cells(
             errors[:, cell] = [sampling_error(promised, percent) for percent in _PERCENTILES]
     pairs = contrasts_reached(chain.from_iterable(answered))
     median, tenth = percentiles
-    return WeakCells(grid, grid.centres(table.plate), median, tenth, errors, pairs)
+    return WeakCells(grid, grid.centers(table.plate), median, tenth, errors, pairs)
 
 
 def sampling_error(values: ArrayLike, percent: float) -> float:
@@ -160,7 +160,7 @@ def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
     is_symmetric_along_x = (True, False) in images
     is_symmetric_along_y = (False, True) in images
     questions: list[list[Placement]] = []
-    centers = grid.centres(plate)
+    centers = grid.centers(plate)
     is_on_plate = plate.covers(centers)
     for number, center in enumerate(centers):
         if not is_on_plate[number]:

@@ -137,12 +137,12 @@ class Raster:
         """Positions [m], (point_count, 2)."""
         return lattice(self.x, self.y)
 
-    def fingertips(self, centres: FloatArray, values: Float32Array) -> "FingertipShapes":
+    def fingertips(self, centers: FloatArray, values: Float32Array) -> "FingertipShapes":
         """Values (point_count, r) at the fingertips centered at (k, 2) [m] on the plate."""
         points, weights = fingertips_on(
-            centres, length=self.length, width=self.width, rule=FIVE_AND_FINE
+            centers, length=self.length, width=self.width, rule=FIVE_AND_FINE
         )
-        index, interpolation = self._patches(centres, points)
+        index, interpolation = self._patches(centers, points)
         shapes = interpolation @ values.take(index, axis=0)
         few, fine = weights.astype(np.float32)
         return FingertipShapes(
@@ -198,13 +198,13 @@ class Raster:
             coefficients[axis, 0, :count, :count] = np.linalg.inv(powers)
         return coefficients
 
-    def _patches(self, centres: FloatArray, points: FloatArray) -> tuple[IntArray, Float32Array]:
+    def _patches(self, centers: FloatArray, points: FloatArray) -> tuple[IntArray, Float32Array]:
         """Raster points around centers (k, 2), and their weights at points (k, p, 2) nearby.
 
         (k, patch) and (k, p, patch).
         """
         (count, spacing), side = self._points, np.array(self.patch)
-        start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
+        start = np.rint(centers / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1
         powers = np.vander(local.transpose(2, 0, 1).ravel(), max(side), increasing=True)
@@ -294,7 +294,7 @@ class LocalizationTable:
     shapes: NDArray[np.float32]
     """Mode shapes (points, r) [1/sqrt(kg)] on the raster."""
     reference_mesh: PlateMesh
-    discretisation_error: FloatArray
+    discretization_error: FloatArray
     """Estimated relative L2 error (f,) of the fields over the raster (`model.vibration`), maximum
     over the ERAs."""
     clocks: ClockErrors = EXACT_CLOCKS
@@ -405,14 +405,14 @@ class LocalizationTable:
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
         """Highest level [dB SL] of any `switched` pattern at the center of each cell, (cells,)."""
-        fields = self.unit_fields(self.cell_centres).transpose(2, 0, 1) / self.thresholds[:, None]
+        fields = self.unit_fields(self.cell_centers).transpose(2, 0, 1) / self.thresholds[:, None]
         return decibels(highest_levels(fields[:, None]).astype(float))
 
     @cached_property
-    def cell_centres(self) -> FloatArray:
+    def cell_centers(self) -> FloatArray:
         """Centers of the grid's cells [m] that are on the plate, (cells, 2)."""
-        centres = self.grid.centres(self.plate)
-        return centres[self.plate.covers(centres)]
+        centers = self.grid.centers(self.plate)
+        return centers[self.plate.covers(centers)]
 
     @cached_property
     def in_time(self) -> PlateInTime:
@@ -604,14 +604,14 @@ class LocalizationTable:
         Includes the uncertainty's `field`, and an object of its `foreign_mass`, averaged over
         possible positions.
         """
-        error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
+        error = np.hypot(self.discretization_error, self.uncertainty.field)[:, None]
         fields = self.on_eras.fields
         power = error**2 * self._mean_square(fields)
         mass = self.uncertainty.foreign_mass
         if mass:
             stiffness = object_load(mass).dynamic_stiffness(self.attached.omega)
             D = stiffness.astype(np.complex64)[:, None]
-            places = self.shapes_at(_OBJECT_PLACES.centres(self.plate)).astype(np.float32)
+            places = self.shapes_at(_OBJECT_PLACES.centers(self.plate)).astype(np.float32)
             for place in places[:, None]:
                 loaded = TouchedPlate(self.on_eras, place, D, np.zeros(1, np.float32))
                 change = self._mean_square(loaded.coordinates() - fields)
@@ -656,7 +656,7 @@ class LocalizationTable:
         side = min(BACKGROUND_CELL, wavelength / CELLS_PER_WAVELENGTH)
         nx = min(max(round(self.plate.length / side), 1), 200)
         ny = min(max(round(self.plate.width / side), 1), 200)
-        points = Grid(nx, ny).centres(self.plate)
+        points = Grid(nx, ny).centers(self.plate)
         points = points[self.plate.covers(points)]
         fields = self.unit_fields(points)
         return points, fields, _power(fields)
@@ -667,8 +667,8 @@ class LocalizationTable:
         """Accelerations of the reduced coordinates due to each ERA at full stroke, (f, eras, r)."""
         if not contacts:
             return self.on_eras.fields
-        centres = self.shapes_at(contacts).astype(np.float32)
-        return touch(self.on_eras, centres, tuple(loads)).coordinates()
+        centers = self.shapes_at(contacts).astype(np.float32)
+        return touch(self.on_eras, centers, tuple(loads)).coordinates()
 
     def background(self, targets: Sequence[Point]) -> Complex64Array:
         """Expected power of the untouched plate outside of the targets, (f, eras, eras).

@@ -118,7 +118,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         **{name: to_jsonable_python(getattr(table, name)) for name in PHYSICS},
         "mesh": str(table.mesh),
         "reference_mesh": str(table.reference_mesh),
-        "discretisation_error": table.discretisation_error.tolist(),
+        "discretisation_error": table.discretization_error.tolist(),
         "frequencies_hz": table.frequencies.tolist(),
         "raster": asdict(table.raster),
         "grid": asdict(table.grid),
@@ -225,7 +225,7 @@ def _assemble(header: _Header, arrays: dict[str, Any]) -> LocalizationTable:
         **physics,
         mesh=parse_mesh(header.mesh, physics["plate"]),
         reference_mesh=parse_mesh(header.reference_mesh, physics["plate"]),
-        discretisation_error=np.array(header.discretisation_error, dtype=float),
+        discretization_error=np.array(header.discretisation_error, dtype=float),
         raster=header.raster,
         grid=header.grid,
         drive_mode=header.mode,
@@ -255,7 +255,7 @@ def _check_arrays(table: LocalizationTable) -> None:
     nodes = len(table.dispersion_frequencies)
     expected = {
         "frequencies": (count,),
-        "discretisation_error": (count,),
+        "discretization_error": (count,),
         "omega": (coordinates,),
         "losses": (coordinates,),
         "dispersion_frequencies": (nodes,),
@@ -393,7 +393,7 @@ def solve_table(
     InputError.
     """
     mode = checked_mode(drive_mode)
-    parts = {0: _discretisation if is_estimated else _no_error, 1: _modes}
+    parts = {0: _discretization if is_estimated else _no_error, 1: _modes}
     solved: dict[str, Any] = {name: getattr(problem.rig, name) for name in PHYSICS}
     # A copy without cached properties, which cannot all be sent to a process.
     results = on_processes(workers, _solve, replace(problem), parts)
@@ -434,7 +434,7 @@ def _modes(problem: TableProblem) -> Arrays:
     }
 
 
-def _discretisation(problem: TableProblem) -> Arrays:
+def _discretization(problem: TableProblem) -> Arrays:
     """Estimated relative L2 error of the fields, maximum over the ERAs (f,)."""
     error = estimate_error(
         problem.free_plate,
@@ -444,11 +444,11 @@ def _discretisation(problem: TableProblem) -> Arrays:
         problem.raster.points[problem.rig.plate.covers(problem.raster.points)],
         loads=problem.rig.masses,
     )
-    return {"discretisation_error": error.max(axis=1)}
+    return {"discretization_error": error.max(axis=1)}
 
 
 def _no_error(problem: TableProblem) -> Arrays:
-    return {"discretisation_error": np.zeros(len(problem.frequencies))}
+    return {"discretization_error": np.zeros(len(problem.frequencies))}
 
 
 MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first

@@ -234,7 +234,7 @@ class Shaper:
         self._full_share = lru_cache(_KEPT)(self._magnet_share)
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
-        self._centers = _SURROUNDINGS.centres(plate.reduced.plate)
+        self._centers = _SURROUNDINGS.centers(plate.reduced.plate)
         self._shapes = plate.shapes_at(self._centers)
         # Readings of the last fingers: contents that begin together have each other's.
         self._fingers: dict[Point, tuple[FloatArray, FloatArray]] = {}

@@ -10,7 +10,7 @@ FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once silent
 entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence. Arm passes through
 READY_TO_SWITCH_ON and SWITCHED_ON immediately.
 
-Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion of
+Not modeled: the rise time of high voltage, the voltage waveform of a tone, and the distortion of
 a limited sum of layers.
 """
 

@@ -1,11 +1,11 @@
 """A CAN bus within this process, amplifiers on it, and adapters to it.
 
-All other members of the bus receive a frame simultaneously. Not modelled: arbitration,
+All other members of the bus receive a frame simultaneously. Not modeled: arbitration,
 retransmission, bus-off.
 
 Adapters use LAWICEL's serial ASCII commands (slcan), which end with CR and are acknowledged with
 CR, or BELL for errors, and socketcand over TCP, with elements `< ... >`. Acceptance masks, time
-stamps and polling are accepted without effect. Not modelled: modes other than raw mode, extended
+stamps and polling are accepted without effect. Not modeled: modes other than raw mode, extended
 identifiers, discovery by broadcast.
 """
 

@@ -81,8 +81,8 @@ def test_solved_plate_with_a_seed_is_another_one() -> None:
     for seed in (None, 1, 1, 2):
         drawn = era.SolvedPlate(replace(PLATE.rig, fingertip=None, uncertainty=pure), seed=seed)
         (felt,) = drawn.play(drive, at).targets
-        centre = np.argmin(np.linalg.norm(felt.points - at, axis=1))
-        peak = np.abs(felt.accelerations[-2000:, centre]).max()
+        center = np.argmin(np.linalg.norm(felt.points - at, axis=1))
+        peak = np.abs(felt.accelerations[-2000:, center]).max()
         assert peak == pytest.approx(drawn.map(drive, raster=(33, 25)).peak[6, 8], rel=0.02)
         peaks.append(peak)
     assert peaks[1] == peaks[2]

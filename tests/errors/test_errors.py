@@ -210,7 +210,7 @@ def test_command_keeps_previous_output_when_the_disk_is_full(
     assert files(home) == before
 
 
-TEN_METRES, URL = Plate(10.0, 10.0, 0.002, material("float-glass")), "sim://"
+TEN_METERS, URL = Plate(10.0, 10.0, 0.002, material("float-glass")), "sim://"
 
 
 def simulated(url: str, *wires: str) -> dict[str, SimulatedWire]:
@@ -226,7 +226,7 @@ PARSERS: dict[str, Callable[[str], object]] = {
     "scheduler": lambda text: [*on_cluster(text, divmod, 1, {0: 1})],
     "material": material,
     "mesh": lambda text: mesh_of(text, RIG.plate, frequency_max=500.0),
-    "mesh of ten metres": lambda text: mesh_of(text, TEN_METRES, frequency_max=500.0),
+    "mesh of ten metres": lambda text: mesh_of(text, TEN_METERS, frequency_max=500.0),
     "wire": lambda text: simulated(URL, *text.split()),
     "URL to simulate": simulated,
     "line": lambda text: choose_lines(simulated("serial:///dev/ttyUSB0"), [text]),

@@ -70,7 +70,7 @@ class PlantedFault:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Judgment:
     """The result for a fault (found, missed or stale); how its tests ended, or what is stale."""
 
     fault: str
@@ -212,13 +212,13 @@ def _list_nightly(faults: Sequence[PlantedFault]) -> None:
     sys.stdout.write(f"{len(nightly)} of {len(faults)} faults are found by `make nightly` alone\n")
 
 
-def judge(fault: PlantedFault, sound: Path) -> Judgement:
+def judge(fault: PlantedFault, sound: Path) -> Judgment:
     """Plant a fault into this worker's copy of a sound tree, and run its tests there."""
     started = time.monotonic()
     try:
         texts = changed_texts(fault, sound)
     except StaleEdit as error:
-        return Judgement(fault.name, "stale", 0.0, {"fault": str(error)})
+        return Judgment(fault.name, "stale", 0.0, {"fault": str(error)})
     with changed_copy(sound, texts) as folder:
         outcomes = run_tests(folder, fault.tests, limit=TIME_LIMIT)
     if outcomes is None:
@@ -229,7 +229,7 @@ def judge(fault: PlantedFault, sound: Path) -> Judgement:
         result = "stale"
     elif not all(_is_finding(outcome, fault.shows) for outcome in outcomes.values()):
         result = "missed"
-    return Judgement(fault.name, result, time.monotonic() - started, outcomes)
+    return Judgment(fault.name, result, time.monotonic() - started, outcomes)
 
 
 def _is_finding(outcome: str, shows: str) -> bool:
@@ -250,7 +250,7 @@ def _failures(
     ]
 
 
-def judge_all(faults: Sequence[PlantedFault], *, workers: int) -> Iterable[Judgement]:
+def judge_all(faults: Sequence[PlantedFault], *, workers: int) -> Iterable[Judgment]:
     """Judge faults in parallel; RuntimeError if one of their tests fails without them."""
     with sound_copy() as sound, ProcessPoolExecutor(workers, FORK) as pool:
         tests = sorted({test for fault in faults for test in fault.tests})
@@ -282,20 +282,20 @@ def main() -> int:
         return 1 if reports else 0
     prepare(are_many=len(faults) > _MANY)
     started = time.monotonic()
-    judgements: list[Judgement] = []
-    for judgement in judge_all(faults, workers=options.workers):
-        sys.stdout.write(f"{judgement}\n")
+    judgments: list[Judgment] = []
+    for judgment in judge_all(faults, workers=options.workers):
+        sys.stdout.write(f"{judgment}\n")
         sys.stdout.flush()
-        judgements.append(judgement)
-    results = Counter(judgement.result for judgement in judgements)
+        judgments.append(judgment)
+    results = Counter(judgment.result for judgment in judgments)
     sys.stdout.write(
         f"{len(faults)} faults: {results['found']} found, {results['missed']} missed, "
         f"{results['stale']} stale; {time.monotonic() - started:.0f} s\n"
     )
-    not_found = [judgement for judgement in judgements if judgement.result != "found"]
-    sys.stdout.writelines(f"not found: {judgement.fault}\n" for judgement in not_found)
+    not_found = [judgment for judgment in judgments if judgment.result != "found"]
+    sys.stdout.writelines(f"not found: {judgment.fault}\n" for judgment in not_found)
     if options.json:
-        rows = [asdict(judgement) for judgement in judgements]
+        rows = [asdict(judgment) for judgment in judgments]
         options.json.write_text(json.dumps(rows, indent=1), "utf-8")
     return 1 if not_found else 0
 

@@ -257,7 +257,7 @@ async def test_summary_explains_silence_while_disarmed(page: Page, era: Client) 
 
 
 async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) -> None:
-    """Two at once, at their places in metres, moved and lifted; the last one is the target."""
+    """Two at once, at their places in meters, moved and lifted; the last one is the target."""
     await arm(page, era)
     async with fingers_down(page, *PLACES):
         for (x, y), (right, down) in zip(await contacts(era, 2), PLACES, strict=True):

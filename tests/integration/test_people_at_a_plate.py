@@ -440,7 +440,7 @@ def test_layout_lies_on_its_plate(name: str) -> None:
     regions = load_layout(EXAMPLES / f"{name}_layout.yaml", plate).regions
     assert len(regions) >= 6
     for region in regions:
-        x, y = region.shape.centre
+        x, y = region.shape.center
         assert 0 < x < plate.length
         assert 0 < y < plate.width
         assert [each.name for each in regions if each.shape.contains(x, y)] == [region.name]

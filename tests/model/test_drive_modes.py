@@ -55,7 +55,7 @@ def forms_on_plate(places, *, targets=1, level=12.0):
     return forms_of(smooth_table(), placed, level)
 
 
-def test_the_loudest_point_of_a_quiet_fingertip_counts_as_modelled():
+def test_the_loudest_point_of_a_quiet_fingertip_counts_as_modeled():
     """Of a rig that is known exactly, in place of the mean of a few points."""
     (places,) = contact_sets(1, fingers=3, seed=8)
     known = replace(smooth_table(), uncertainty=Uncertainty.none())
@@ -136,7 +136,7 @@ def test_phased_equals_closed_form():
 def test_weights_are_not_improved_by_nelder_mead():
     """On the plate with two quiet fingers the three iterations are within 4 % (0.34 dB).
 
-    Of the best score at a frequency by a general optimiser, of real and imaginary parts.
+    Of the best score at a frequency by a general optimizer, of real and imaginary parts.
     """
     (places,) = contact_sets(1, fingers=3, seed=4)
     given = forms_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))

@@ -66,7 +66,7 @@ def test_a_sheet_has_the_lengths_of_the_board(rig: Path, tmp_path: Path, side: s
 def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig: Path, tmp_path: Path, capsys) -> None:
     """A board of 305 x 229 mm takes two pages upright, by hand; sensors are counted as places.
 
-    One off the board is refused by its line, with metres for the millimetres that were meant.
+    One off the board is refused by its line, with meters for the millimeters that were meant.
     """
     sensors, path = tmp_path / "sensors.csv", tmp_path / "template.pdf"
     sensors.write_text("sensor,x_m,y_m\nP1,47,41\n", "utf-8")
@@ -150,8 +150,8 @@ def crossed(axes):
 def test_figures_of_a_table_show_each_cell_and_an_answer():
     """The first row of colours is the lowest y, and no cell of this plate is crossed out.
 
-    The field at the target's centre is near the level asked for, 20 dB SL; three fingers. ERAs that
-    move a nanometre have a picture of words.
+    The field at the target's center is near the level asked for, 20 dB SL; three fingers. ERAs that
+    move a nanometer have a picture of words.
     """
     table = small_table()
     axes = levels_figure(table).axes[0]

@@ -319,5 +319,5 @@ def test_felt_part_passes_tones_up_to_a_kilohertz(
 
 def test_grid_numbers_cells_along_x_first():
     """Three by two cells of 100 mm."""
-    centres = [[x, y] for y in (0.05, 0.15) for x in (0.05, 0.15, 0.25)]
-    np.testing.assert_allclose(Grid(3, 2).centres(PLATE), centres)
+    centers = [[x, y] for y in (0.05, 0.15) for x in (0.05, 0.15, 0.25)]
+    np.testing.assert_allclose(Grid(3, 2).centers(PLATE), centers)

@@ -97,7 +97,7 @@ class Scene(Acted):
     def fingers(self, *numbers: int, is_played: bool = True) -> None:
         """Replace the fingers on the plate; is_played: whether their pattern may be played.
 
-        Patterns are by hand, of one finger or several: metres over 100 um, radians in degrees.
+        Patterns are by hand, of one finger or several: meters over 100 um, radians in degrees.
         """
         self.at = {number: (0.03 + 0.06 * number, 0.1) for number in numbers}
         first, second = {0: [(110.0, 0.2, 90.0)]}, {1: [(150.0, 0.4, 180.0)]}

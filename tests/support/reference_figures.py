@@ -40,7 +40,7 @@ def reference_figures() -> dict[str, list[float]]:
         "table_acceleration": np.linalg.norm(
             table.unit_fields(table.raster.points), axis=2
         ).ravel(),
-        "table_discretisation_error": table.discretisation_error,
+        "table_discretisation_error": table.discretization_error,
         "table_shapes": np.linalg.norm(table.shapes[:, :8], axis=0),
     }
     problem = DesignProblem(rig, 4, area_of("edge", rig.plate), anywhere(rig.plate))

@@ -161,7 +161,7 @@ def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:
     targets = []
     for name in (region.on_press, region.on_move):
         if name is not None:
-            target = strongest_target(layout, name, region, at=region.shape.centre)
+            target = strongest_target(layout, name, region, at=region.shape.center)
             if target is not None:
                 targets.append(target)
     return min(targets, key=lambda target: target.is_short, default=None)
@@ -173,7 +173,7 @@ def _distant_positions(
     """Return a few positions in a region: the center, then each the farthest from the previous
     ones."""
     candidates, _ = touch_positions(layout, region, table.plate)
-    center = region.shape.centre
+    center = region.shape.center
     positions: list[Point] = []
     while candidates and len(positions) < _POSITIONS:
         if positions:
@@ -191,7 +191,7 @@ def _closest(
     candidates = [*groups]
     sizes = []
     for group in candidates:
-        centers = [touched.region.shape.centre for touched in group]
+        centers = [touched.region.shape.center for touched in group]
         sizes.append(sum(math.dist(*pair) for pair in combinations(centers, 2)))
     smallest = sorted(range(len(sizes)), key=sizes.__getitem__)[:count]
     return [candidates[number] for number in sorted(smallest)]

@@ -153,7 +153,7 @@ def _check(
     positions, area = touch_positions(layout, region, table.plate, count)
     start = (0.0, 0.0)
     if region is not None:
-        start = region.shape.centre
+        start = region.shape.center
     elif positions:
         start = positions[0]
     target = strongest_target(layout, name, region, at=start)

@@ -78,7 +78,7 @@ class JudgeClient(ABC):
       wire time of the longest reply. pace: upper bound of the fraction of wire_time that the line
       really takes (a terminal has no bit times).
     - loss: why the line was lost. last_bytes: received since the last request.
-    - neighbours: other addresses that reply. free_address: the highest address without a reply.
+    - neighbors: other addresses that reply. free_address: the highest address without a reply.
       Both are set by `look_around`.
     - fastest: shortest exchange by message name [s]. lateness: of this machine and of replies.
     """
@@ -113,7 +113,7 @@ class JudgeClient(ABC):
         self.pace = 1.0
         self.loss: str | None = None
         self.last_bytes = b""
-        self.neighbours: frozenset[int] = frozenset()
+        self.neighbors: frozenset[int] = frozenset()
         self.free_address = 0
         self.fastest: dict[str, float] = {}
         self.lateness = Lateness()
@@ -301,7 +301,7 @@ class JudgeClient(ABC):
         is_one_free = len(free_addresses) > 0
         verify(is_one_free, "addresses without a reply", expected="one at least", actual="none")
         self.free_address = free_addresses[0]
-        self.neighbours = self.neighbours or frozenset(self._heard_addresses)
+        self.neighbors = self.neighbors or frozenset(self._heard_addresses)
 
     async def _query_individually(self, addresses: Sequence[int]) -> None:
         for address in addresses:

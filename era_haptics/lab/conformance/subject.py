@@ -439,9 +439,9 @@ class Subject(Stimuli):
 
     def require_alone(self) -> None:
         """Raise NotApplicable if a broadcast would reach other amplifiers."""
-        neighbours = ", ".join(map(str, sorted(self.client.neighbours)))
-        reason = f"a broadcast would reach other amplifiers on the line ({neighbours})"
-        require(not neighbours, reason)
+        neighbors = ", ".join(map(str, sorted(self.client.neighbors)))
+        reason = f"a broadcast would reach other amplifiers on the line ({neighbors})"
+        require(not neighbors, reason)
 
     # Sets
 

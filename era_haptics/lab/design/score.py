@@ -135,7 +135,7 @@ class Scorer:
         self._points = points.reshape(-1, 2)
         self._weights: Float32Array = weights.astype(np.float32)  # (m, p), the center first
         has_field = rig.uncertainty.field > 0
-        self._cells = Grid(12, 9).centres(plate) if has_field else np.empty((0, 2))
+        self._cells = Grid(12, 9).centers(plate) if has_field else np.empty((0, 2))
         sizes = [len(contacts) for contacts in sets]
         self._groups = _grouped_by_size(numbers.ravel(), sizes)
         self._own = self._own_receptances(centers)

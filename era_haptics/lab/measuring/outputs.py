@@ -171,10 +171,10 @@ def matched(
     Signs are relative to the majority. Raises InputError if another assignment fits nearly as well.
     """
     measured = _normalized(values)
-    modelled = _normalized(model)
+    modeled = _normalized(model)
     delays = np.exp(2j * np.pi * np.outer(_DELAYS, frequencies))
     similarities = np.einsum(
-        "tf,ofs,efs->toe", delays, measured, modelled.conj(), optimize=True
+        "tf,ofs,efs->toe", delays, measured, modeled.conj(), optimize=True
     ).real
     best, rows, eras, delay = _assigned(np.abs(similarities))
     for row, era in zip(rows, eras, strict=True):

@@ -299,7 +299,7 @@ DEFAULTS = {
 def test_reload_applies_layouts_alone_and_raises_no_level_while_armed(
     folder: Path, change: dict[str, str], while_armed: str, disarmed: str
 ) -> None:
-    """From 20 dB SL to 21, or to whatever the neighbours allow, in use or not, only once disarmed.
+    """From 20 dB SL to 21, or to whatever the neighbors allow, in use or not, only once disarmed.
 
     A layout that changed with another key is not applied either; the key is named. Of the rig's
     file the content counts, not its name, for limits may have changed in it.

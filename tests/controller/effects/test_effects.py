@@ -126,7 +126,7 @@ SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
             At(102.0, {1: 20.0}, [ONE]),
         ],
     ),
-    # Half a millimetre across it is noise and no crossing; a millimetre of way is.
+    # Half a millimeter across it is noise and no crossing; a millimeter of way is.
     "a finger on an edge keeps its region": (
         SurfaceLayout(
             (left(on_press="tick"), right("tock")),
@@ -302,7 +302,7 @@ def test_a_press_outlasts_its_layout_beside_an_older_finger() -> None:
 def test_ramp_rises_in_steps(
     ramp: Ramp, level: float | None, step: float, levels: list[float | None]
 ) -> None:
-    """Over its duration; then it holds the last level, or as strong as the neighbours allow."""
+    """Over its duration; then it holds the last level, or as strong as the neighbors allow."""
     course = ramp.start(finger(1), 5.0, level_db_sl=level)
     felt = [course.feel(finger(1), 5.0 + step * number + 1e-9) for number in range(len(levels))]
     assert [getattr(one, "level_db_sl", None) for one in felt] == levels

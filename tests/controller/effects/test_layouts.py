@@ -1,6 +1,6 @@
 """Surface layouts: their files and reference page, dials, and files of content as effects.
 
-Detents of a dial are at angles about the centre of its region; the clicks of a file are felt one
+Detents of a dial are at angles about the center of its region; the clicks of a file are felt one
 after the other.
 """
 
@@ -32,7 +32,7 @@ KNOB = Region("knob", Circle(*CENTRE, 0.05), on_move="dial")
 
 
 def at(degrees: float, *, radius: float = 0.03) -> Contact:
-    """A finger at an angle about the centre."""
+    """A finger at an angle about the center."""
     turn = math.radians(degrees)
     x, y = CENTRE[0] + radius * math.cos(turn), CENTRE[1] + radius * math.sin(turn)
     return Contact(ContactKey("panel", 1), x, y, since=0.0)
@@ -64,20 +64,20 @@ def test_dial_clicks_at_every_detent_of_two_turns(sense: int) -> None:
     ],
     ids=["out and in", "trembling at a detent", "across the centre"],
 )
-def test_dial_ignores_radius_noise_and_its_centre(way: list[Contact], expected: list[int]) -> None:
-    """Across the centre the angle jumps by half a turn; then it goes on from there."""
+def test_dial_ignores_radius_noise_and_its_center(way: list[Contact], expected: list[int]) -> None:
+    """Across the center the angle jumps by half a turn; then it goes on from there."""
     assert clicks(way, spacing=math.radians(20)) == expected
 
 
-def test_player_gives_a_dial_the_centre_of_its_region() -> None:
-    """A quarter of a turn about that centre is nine detents of 10 degrees; elsewhere nothing.
+def test_player_gives_a_dial_the_center_of_its_region() -> None:
+    """A quarter of a turn about that center is nine detents of 10 degrees; elsewhere nothing.
 
-    Centres by hand: of a rectangle, and of an L of three unit squares at (5/6, 5/6).
+    Centers by hand: of a rectangle, and of an L of three unit squares at (5/6, 5/6).
     """
-    assert Rectangle(1.0, 2.0, 4.0, 2.0).centre == (3.0, 3.0)
+    assert Rectangle(1.0, 2.0, 4.0, 2.0).center == (3.0, 3.0)
     corners = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0), (1.0, 2.0), (0.0, 2.0))
     for points in (corners, corners[::-1]):
-        assert Polygon(points).centre == pytest.approx((5 / 6, 5 / 6))
+        assert Polygon(points).center == pytest.approx((5 / 6, 5 / 6))
     layout = SurfaceLayout((KNOB,), {"dial": Dial(spacing=math.radians(10))}, elsewhere=None)
     player = EffectPlayer(layout)
     player.intent([at(0)], 0.0)
@@ -112,7 +112,7 @@ EXAMPLE = Path(__file__).parents[3] / "controller" / "effects" / "example.yaml"
 
 
 def test_load_layout_reads_the_example() -> None:
-    """Its numbers are in metres."""
+    """Its numbers are in meters."""
     layout = load_layout(EXAMPLE, load_rig(example_rig_path()).plate)
     assert [region.name for region in layout.regions] == [
         "keypad",

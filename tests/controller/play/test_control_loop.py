@@ -279,7 +279,7 @@ PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, 
 
 
 @in_virtual_time
-async def test_a_click_restates_what_its_neighbour_feels_and_only_meanwhile() -> None:
+async def test_a_click_restates_what_its_neighbor_feels_and_only_meanwhile() -> None:
     """Foreign level: none of 40 ms is above it on this plate; contrast: by powers, by hand."""
     async with fingers_on(table(), PLAYED, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
         before = len(fingers.applied)
@@ -680,7 +680,7 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
 
 @in_virtual_time
 async def test_vibration_of_a_finger_that_moves_whenever_the_loop_turns_is_renewed() -> None:
-    """By half a millimetre, which changes nothing else: there is no gap."""
+    """By half a millimeter, which changes nothing else: there is no gap."""
     async with set_running(of=Played) as chain:
         number, x, y = FINGER
         step, chain.at = chain.controller.cycle.step, {number: (x, y)}

@@ -289,7 +289,7 @@ async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
 
 @pytest.mark.long
 @in_virtual_time
-async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
+async def test_weights_follow_a_finger_at_half_a_meter_a_second() -> None:
     """10 cm in 0.2 s: several answers on the way, after which as little leaks as before."""
     async with fingers_on(
         paper_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0

@@ -27,7 +27,7 @@ NEAR, FAR, THIRD, FOURTH = (0.09, 0.07), (0.25, 0.18), (0.05, 0.19), (0.24, 0.06
 QUIET = (0.16, 0.20)
 
 
-def as_modelled(fingers):
+def as_modeled(fingers):
     """The nominal plate, with so many fingers."""
     one = np.ones(1)
     return Plates(
@@ -55,12 +55,12 @@ def as_modelled(fingers):
     ],
     ids=["quiet", "asks for nothing", "beside a target"],
 )
-def test_figures_as_modelled_are_those_of_the_exact_plate(contents, other):
+def test_figures_as_modeled_are_those_of_the_exact_plate(contents, other):
     """Levels and contrasts without errors, at fingers with a content, quiet ones and others."""
     table, own = smooth_table(), (NEAR, FAR, THIRD)[:contents]
     found = answer(table, [wants(at) for at in own], [other], min_contrast_db=-99)
     lying = {} if other.is_protected else {"resting": [other.at]}
-    exact = realised(table, found, as_modelled(contents + 1), **lying)
+    exact = realised(table, found, as_modeled(contents + 1), **lying)
     contrasts, levels = exact.contrast[:, 0].tolist(), exact.own[:contents, 0]
     expected = contrasts if other.is_protected else [*contrasts[:contents], None]
     assert [each.contrast_db for each in found.fingers] == pytest.approx(expected, abs=0.02)
@@ -82,7 +82,7 @@ def test_a_hand_that_rests_is_counted_and_not_protected():
     fingers = [wants(NEAR, level_db_sl=12), wants(FAR, level_db_sl=12)]
     lying = {"resting": patches, "loads": (1.0, 1.0, *(HAND_LOAD,) * 4)}
     found = answer(table, fingers, [Finger(HAND, load=HAND_LOAD)], min_contrast_db=-99)
-    nominal = realised(table, found, as_modelled(6), **lying).contrast[:2, 0]
+    nominal = realised(table, found, as_modeled(6), **lying).contrast[:2, 0]
     assert [each.contrast_db for each in found.fingers[:2]] == pytest.approx(nominal, abs=0.02)
     assert found.fingers[2].foreign_level_db_sl is found.fingers[2].contrast_db is None
     rng = np.random.default_rng(3)

@@ -13,7 +13,7 @@ from kit.set_table import only, wants
 from kit.set_table import phased as answer
 from model.answer.answer_report import (
     Timing,
-    cell_centres,
+    cell_centers,
     concentration_of,
     exposures,
     hand_weighting,
@@ -79,11 +79,11 @@ def test_exposure_is_the_weighted_root_mean_square_of_all_that_a_finger_feels():
 TARGET = (0.15, 0.12)
 PLATE = smooth_rig().plate
 AREA = PLATE.length * PLATE.width
-POINTS = cell_centres(PLATE)
+POINTS = cell_centers(PLATE)
 
 
 def concentration(*amplitudes, frequencies=(100.0,)):
-    """Concentration of amplitudes (f, p) at the centres of cells, 1 m/s² at the target."""
+    """Concentration of amplitudes (f, p) at the centers of cells, 1 m/s² at the target."""
     field = np.array(amplitudes, dtype=float)
     return concentration_of(
         np.array(frequencies), field, ~is_beyond(POINTS, [TARGET]), felt=1.0, plate=PLATE

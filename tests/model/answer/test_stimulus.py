@@ -606,15 +606,15 @@ def test_the_band_decides_an_answer_and_the_grid_of_summaries_does_not(mode):
     ],
 )
 def test_query_without_quiet_fingers_contrasts_with_the_plate_around(targets, mode):
-    """The ratio of levels to the rms of cell centres beyond 5 cm of every target is in the answer.
+    """The ratio of levels to the rms of cell centers beyond 5 cm of every target is in the answer.
 
     The plate around is that without fingers, which change it little.
     """
     table = smooth_table()
     found = query(table, Placement(targets), drive_mode=mode)
     layer, felt = found.layers[0], found.fingers[: len(targets)]
-    centres = table.cell_centres
-    far = centres[[min(math.dist(centre, each) for each in targets) > 0.05 for centre in centres]]
+    centers = table.cell_centers
+    far = centers[[min(math.dist(center, each) for each in targets) > 0.05 for center in centers]]
     frequencies, amplitudes = table.amplitudes(layer.excitation, far)
     above = ((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1)
     around = 10 * np.log10(above.mean())

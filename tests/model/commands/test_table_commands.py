@@ -163,7 +163,7 @@ def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> No
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("depth", "is_light"), [("4.6 in", True), ("9 in", False)])
 def test_design_warns_of_a_plate_that_nearly_tips(small, tmp_path: Path, depth, is_light) -> None:
-    """An ERA a tenth of an inch behind the centre of mass carries all but 2 % of the weight."""
+    """An ERA a tenth of an inch behind the center of mass carries all but 2 % of the weight."""
     layout = f"layouts:\n  tee: [[0, 0], [12 in, 0], [6 in, {depth}]]\n"
     (tmp_path / "layouts.yaml").write_text(layout)
     found = design("--layouts", tmp_path / "layouts.yaml", "-o", tmp_path)

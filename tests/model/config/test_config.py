@@ -27,7 +27,7 @@ from model.config.units import (
     STIFFNESS,
     TEMPERATURE,
     Dimension,
-    in_metres,
+    in_meters,
     quantity,
     unit_scale,
 )
@@ -139,11 +139,11 @@ def test_data_text_is_read_back_as_it_was() -> None:
         ((float("inf"), 6.0), ""),
     ],
 )
-def test_in_metres_converts_places_that_smaller_units_put_on_the_plate(
+def test_in_meters_converts_places_that_smaller_units_put_on_the_plate(
     place: tuple[float, float], remedy: str
 ) -> None:
-    """The plate is 0.3 m by 0.2 m; no finger is half a centimetre from a corner."""
-    assert in_metres(*place, length=0.3, width=0.2).rpartition(" ")[2] == remedy
+    """The plate is 0.3 m by 0.2 m; no finger is half a centimeter from a corner."""
+    assert in_meters(*place, length=0.3, width=0.2).rpartition(" ")[2] == remedy
 
 
 SI = {

@@ -18,7 +18,7 @@ from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, FloatArray
-from model.ensemble.attached_plate import MODELLED, PlateOnEras, attach, thickness_nodes
+from model.ensemble.attached_plate import MODELED, PlateOnEras, attach, thickness_nodes
 from model.ensemble.draws import (
     PROMISED_DRAWS,
     ClockErrors,
@@ -202,8 +202,8 @@ def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
 
     Which is smaller by exp(-p² / 2), p = 2 pi f times 0.2 ms; all else is certain.
     """
-    exact = np.zeros_like(late_table().discretisation_error)
-    known = replace(late_table(), uncertainty=Uncertainty.none(), discretisation_error=exact)
+    exact = np.zeros_like(late_table().discretization_error)
+    known = replace(late_table(), uncertainty=Uncertainty.none(), discretization_error=exact)
     off = known.with_clocks(clocks(a=2e-4, b=2e-4))
     fingers = FingersOnPlate.of(off, [(0.09, 0.07), (0.25, 0.18)], ())
     rows, n = np.array([3, 12, 25]), 4
@@ -319,7 +319,7 @@ def solved(uncertainty, loads=(), *, rig=RIG, count=3, modulus=0.0):
     )
 
 
-def changed(touched, points, weights, *, node=MODELLED):
+def changed(touched, points, weights, *, node=MODELED):
     """Accelerations at all frequencies by weights, and their changes by each parameter."""
     at, nodes = np.arange(4), np.full(4, node)
     by_force, moved = touched.sources(at, nodes, points)
@@ -436,7 +436,7 @@ def test_thickness_is_exact_at_its_nodes(modulus):
         by_era = touched_plate_directly(thickness=h, modulus=round(stiffer, 12))
         exact = np.einsum("e,fep->fp", TOUCHED_PLATE_WEIGHTS, by_era)
         assert furthest(found[node], exact) < 5e-3
-    nominal = touched.fields(at, np.full(4, MODELLED), weights, points)
+    nominal = touched.fields(at, np.full(4, MODELED), weights, points)
     size = float(np.abs(nominal).max())
     assert found[2] == pytest.approx(nominal, rel=1e-3, abs=1e-4 * size)
     assert np.abs(found[0] + found[4] - 2 * nominal).max() > 0.1 * size
@@ -460,7 +460,7 @@ def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(wh
 
 def felt_of(touched, points, weights, **drawn):
     """What drawn plates feel of a tone of weights (4, n) at each frequency, at all points."""
-    count = len(touched.centres)
+    count = len(touched.centers)
     error = np.zeros((4, 4), np.float32)
     if drawn["count"] < 100:
         error[1:3] = [[1e-4], [1e-2]]
@@ -507,7 +507,7 @@ def test_every_stage_is_that_of_numpy(rig, count):
     loads = (0.4, 12.0, 2.5)[:count]  # a finger, a hand, a finger
     touched, _, points = solved(replace(Uncertainty(), supports=0.3), loads, rig=rig, count=count)
     by_numpy = TouchedPlate(
-        touched.plate_on_eras, touched.centres, touched.stiffness, touched.load_std
+        touched.plate_on_eras, touched.centers, touched.stiffness, touched.load_std
     )
     weights = np.tile(TOUCHED_PLATE_WEIGHTS, (4, 1))
     few, shares = points.reshape(count, 5, -1), np.tile(FIVE_POINTS.weights, (count, 1))
@@ -516,10 +516,10 @@ def test_every_stage_is_that_of_numpy(rig, count):
         each.forms(np.array([2, 0, 3]), few, shares.astype(np.float32), error, few[:, 1:3])
         for each in (touched, by_numpy)
     ]
-    # All fingers in one group, at their centres, whose fields are known already.
+    # All fingers in one group, at their centers, whose fields are known already.
     thirds = np.full((1, count), 1 / count, np.float32)
     together = [
-        each.forms(np.arange(4), touched.centres[None], thirds, error, few[:1, 1:3])
+        each.forms(np.arange(4), touched.centers[None], thirds, error, few[:1, 1:3])
         for each in (touched, by_numpy)
     ]
     felt = [

@@ -81,7 +81,7 @@ def test_report_has_the_feet_that_responses_tell_of_and_names_others() -> None:
 def off(found: Rig, true: Rig) -> FloatArray:
     """Distances of places in a rig to the true ones along both sides, by the error it states.
 
-    In shares of the sides, which a rig does not have by half a millimetre.
+    In shares of the sides, which a rig does not have by half a millimeter.
     """
     places, at = (
         np.array([(era.x / rig.plate.length, era.y / rig.plate.width) for era in rig.eras])

@@ -1,4 +1,4 @@
-"""How a plate rests on its supports: loads, centres of mass and tipping, by levers and moments."""
+"""How a plate rests on its supports: loads, centers of mass and tipping, by levers and moments."""
 
 import math
 from dataclasses import replace
@@ -56,10 +56,10 @@ def test_stiff_feet_carry_more_than_soft_ones() -> None:
 @pytest.mark.parametrize(("share", "is_outside", "is_near"), [
     (0.45, True, False), (0.52, False, True), (0.7, False, False),
 ])  # fmt: skip
-def test_centre_of_mass_near_the_edge_of_the_feet_is_reported(
+def test_center_of_mass_near_the_edge_of_the_feet_is_reported(
     share: float, is_outside: bool, is_near: bool
 ) -> None:
-    """Feet at one end and at a share of the length: the centre is at half of it."""
+    """Feet at one end and at a share of the length: the center is at half of it."""
     rig = on_feet(*(foot(x * LENGTH, y) for x in (0, share) for y in (0, WIDTH)))
     balance = RigBalance(rig)
     assert balance.tips_over == is_outside
@@ -85,7 +85,7 @@ def test_foot_that_is_lifted_is_named() -> None:
     """A beam on equal springs at 0, 0.1 and 1 of its length, with most of its mass at one end.
 
     Each carries W / 3 + W (c - m) (x - m) / S, with the mean m and the sum of squares S of the
-    positions and the centre c: of three pairs of feet the one at the far end is pulled.
+    positions and the center c: of three pairs of feet the one at the far end is pulled.
     """
     positions = np.array([0.0, 0.1, 1.0])
     feet = [foot(x * LENGTH, y) for x in positions for y in (0, WIDTH)]

@@ -591,7 +591,7 @@ def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(
 ) -> None:
     """It lies on the line between two complex gains, and is the last one beyond.
 
-    The ERA's own response is multiplied, not its neighbours'.
+    The ERA's own response is multiplied, not its neighbors'.
     """
     low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)
     frequencies, points = np.array([50.0, 100.0, 125.0, 300.0]), np.array([[0.1, 0.05], [0.2, 0.2]])

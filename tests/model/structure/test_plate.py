@@ -391,7 +391,7 @@ def test_rigid_body_frequencies_are_those_of_the_textbook(
 ) -> None:
     """Heave sqrt(4k/m); each tilt of four corner springs sqrt(12 k/m).
 
-    A mass of the plate's own at its centre slows the heave alone, by sqrt(2).
+    A mass of the plate's own at its center slows the heave alone, by sqrt(2).
     """
     heave = math.sqrt(4 * 17e3 / ATTACHMENTS_PLATE.mass) / (2 * math.pi)
     expected = [heave / slower, math.sqrt(3) * heave, math.sqrt(3) * heave]

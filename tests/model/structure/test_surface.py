@@ -73,7 +73,7 @@ def modes() -> Mapping[str, FloatArray]:
 
 
 def _universal(modes: Mapping[str, FloatArray], *, kind: int, length: float) -> str:
-    """A universal file of modes, datasets 55 or 2414, in a unit of length per metre."""
+    """A universal file of modes, datasets 55 or 2414, in a unit of length per meter."""
     rows = ["    -1", "   164", f"{1:10d}{'SI':<20}{2:10d}", f"{length:25.16E}{1.0:25.16E}"]
     rows += [f"{0.0:25.16E}", "    -1", "    -1", "  2411"]
     for number, node in enumerate(modes["nodes"], start=1):
@@ -105,7 +105,7 @@ def _write(folder: Path, modes: Mapping[str, Any], **further: Any) -> Path:
 
 def _difference(own: LocalizationTable, other: LocalizationTable) -> float:
     """Relative L2 error of the fields at cells by the worst ERA, mean over frequencies."""
-    points = own.cell_centres
+    points = own.cell_centers
     first, second = own.unit_fields(points), other.unit_fields(points)
     size = np.linalg.norm(first, axis=-1)
     return float((np.linalg.norm(first - second, axis=-1) / size).max(axis=1).mean())
@@ -144,7 +144,7 @@ def test_plate_by_its_own_modes_has_the_fields_of_its_table(
         load_rig(tmp_path / "rig.yaml")
 
 
-def test_surface_has_the_centre_of_mass_of_its_modes(
+def test_surface_has_the_center_of_mass_of_its_modes(
     modes: Mapping[str, FloatArray], tmp_path: Path
 ) -> None:
     """Of the paper's plate with 50 g at a node, solved from its own modes; in the middle without.
@@ -196,7 +196,7 @@ def test_few_modes_are_off_as_much_as_stated(
         rig = load_rig(_write(tmp_path, modes, **known))
         tables.append(build_table(rig))
         assert all(check.is_passed for check in verify_table(tables[-1], rig, samples=1).content)
-    stated = float(tables[-1].discretisation_error.mean())
+    stated = float(tables[-1].discretization_error.mean())
     assert 0.01 < stated < 0.3
     assert stated / 2 < _difference(own, tables[-1]) < 1.5 * stated
 
@@ -346,14 +346,14 @@ def test_cut_out_has_no_fingers(
     )
     assert ([each.key.id for each in change.down], change.rejected) == ([2], ("off_plate",))
     table = build_table(rig)
-    assert len(table.cell_centres) < table.grid.cell_count
-    cells, questions = map_grid(table).centres(rig.plate), pair_questions(table)
+    assert len(table.cell_centers) < table.grid.cell_count
+    cells, questions = map_grid(table).centers(rig.plate), pair_questions(table)
     assert [bool(each) for each in questions] == rig.plate.covers(cells).tolist()
     asked = [placed.contacts for of_cell in questions for placed in of_cell]
     assert rig.plate.covers(np.vstack(asked)).all()
     assert mirror_images(table) == [(False, False)]
     candidates = area_of("anywhere", rig.plate).candidates(0.02)  # for ERAs
-    assert rig.plate.covers(np.vstack([table.cell_centres, candidates])).all()
+    assert rig.plate.covers(np.vstack([table.cell_centers, candidates])).all()
     monkeypatch.setattr(layout_check, "MAX_REGION_TOUCHES", 6)
     (checked,) = check_layout(SurfaceLayout((), {"click": Click()}, elsewhere="click"), table)
     fingers = [touch.at for touch in checked.touches]

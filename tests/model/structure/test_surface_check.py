@@ -226,12 +226,12 @@ FREE_FAULTS: dict[str, tuple[Callable[[Modes], Modes], float | None, str]] = {
         None,
         r"modes must differ, got modes 9 and 25 \(at 290\.\d+ and 290\.\d+ Hz\)",
     ),
-    "millimetres": (
+    "millimeters": (
         lambda free: free | {"nodes": 1000 * free["nodes"]},
         None,
         r"sides must be in meters, got 400 x 300 m \(0\.4 x 0\.3 m if they are in mm\)",
     ),
-    "kilometres": (
+    "kilometers": (
         lambda free: free | {"nodes": free["nodes"] / 1000},
         None,
         r"sides must be in meters, got 0\.0004 x 0\.0003 m; convert",

@@ -133,7 +133,7 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
     np.testing.assert_array_equal(struct.acceleration_m_s2.transpose(1, 2, 0), fields)
     np.testing.assert_array_equal(struct.frequency_hz, FREQUENCIES)
     np.testing.assert_array_equal(struct.mode_shape, table.shapes)
-    np.testing.assert_array_equal(struct.cell_centre_m, table.cell_centres)
+    np.testing.assert_array_equal(struct.cell_centre_m, table.cell_centers)
     assert len(struct.raster_x_m) * len(struct.raster_y_m) == len(struct.acceleration_m_s2)
     assert struct.fingerprint == table.fingerprint
     assert struct.mode == "switched"
@@ -248,7 +248,7 @@ def test_export_csv_of_fields(table, tmp_path):
     assert found == table.unit_fields(table.raster.points)[2, 2, 7]
 
 
-QUIET = (0.2286, 0.0381)  # m; centre of the fourth cell of the lowest row
+QUIET = (0.2286, 0.0381)  # m; center of the fourth cell of the lowest row
 MODES = ("switched", "phased")
 
 
@@ -305,7 +305,7 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
         return drawn[target][-1], 0.0
 
     weak = find_weak_cells(table, [[*map(at_random, each)] for each in pair_questions(table)])
-    assert len(drawn) == len(weak.centres) == 12
+    assert len(drawn) == len(weak.centers) == 12
     for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
         for value, contrasts in zip(values, drawn.values(), strict=True):
             below = (np.array(contrasts) < value).mean()

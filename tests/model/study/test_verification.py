@@ -88,7 +88,7 @@ def test_tolerances_follow_from_the_error_of_the_field(verified, coarse_rig, tab
         contacts = (*check.placed.targets, *check.placed.quiet)
         discs = [fingertip_points(*place, coarse_rig.plate) for place in contacts]
         weights = fingertip_weights(*contacts[0], coarse_rig.plate)
-        points = np.vstack([*discs, Grid(8, 6).centres(coarse_rig.plate)])
+        points = np.vstack([*discs, Grid(8, 6).centers(coarse_rig.plate)])
         frequencies, fields = tone_fields(
             only(table, check.placed)[0].excitation,
             coarse_rig.eras,
@@ -265,7 +265,7 @@ def directly(rig, layer, number, *, targets=1, pressed=(1, 1, 1)):
 def test_felt_on_agrees_with_the_direct_solve(targets, mode, loads):
     """Thicker, softer, damped otherwise, misdriven, other fingers and feet: within 0.15 dB.
 
-    So is the nominal contrast of an answer on the first of the plates, which is the modelled one.
+    So is the nominal contrast of an answer on the first of the plates, which is the modeled one.
     Contrasts of fingers that press alike are off by more where these do not.
     """
     places, alike = (TARGET, *QUIET), (1, 1, 1)
@@ -292,7 +292,7 @@ def test_an_object_that_may_lie_anywhere_is_an_error_of_fields():
     points = table.raster.points
     alone = free.acceleration(rig.eras, frequencies, points)
     changed = np.zeros(alone.shape[:2])
-    for x, y in Grid(6, 5).centres(rig.plate):
+    for x, y in Grid(6, 5).centers(rig.plate):
         load = PointLoad(x, y, mass=0.005)
         beside = free.acceleration(rig.eras, frequencies, points, loads=[load])
         changed += (np.abs(beside - alone) ** 2).mean(axis=2) / 30
@@ -307,7 +307,7 @@ def test_error_power_is_the_error_of_the_direct_field():
     direct = direct_acceleration(
         assemble(rig.plate, rig.mesh), rig.eras, np.array([frequency]), table.raster.points
     )[0, 1]
-    expected = table.discretisation_error[8] ** 2 * (np.abs(direct) ** 2).mean()
+    expected = table.discretization_error[8] ** 2 * (np.abs(direct) ** 2).mean()
     assert table.error_power[8, 1] == pytest.approx(expected, rel=1e-3)
 
 

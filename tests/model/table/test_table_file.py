@@ -201,7 +201,7 @@ def test_build_is_the_same_to_the_bit_by_two_processes(tmp_path):
 
 
 @pytest.mark.long
-def test_build_states_the_discretisation_error_of_the_worst_era():
+def test_build_states_the_discretization_error_of_the_worst_era():
     """That of a convergence study, on elements and another raster, with an ERA inside the plate."""
     rig, frequencies = quick_rig(lowest=40.0, highest=120.0), [60.0, 90.0, 110.0]
     rig = replace(rig, eras=(replace(rig.eras[0], x=0.11, y=0.09), *rig.eras[1:]))
@@ -209,7 +209,7 @@ def test_build_states_the_discretisation_error_of_the_worst_era():
     table = solve_table(problem, drive_mode="switched")
     study = study_convergence(rig, [rig.mesh], frequencies=frequencies)
     assert table.reference_mesh != study.reference
-    np.testing.assert_allclose(table.discretisation_error, study.errors[0].response, rtol=0.1)
+    np.testing.assert_allclose(table.discretization_error, study.errors[0].response, rtol=0.1)
 
 
 def quick_rig(nx=12, ny=9, lowest=60.0, highest=100.0):

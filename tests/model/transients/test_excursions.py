@@ -124,7 +124,7 @@ def board(rig: Rig, rng: np.random.Generator) -> Rig:
 
 @pytest.mark.parametrize("frequency", [90.0, 100.0])
 def test_nine_of_ten_boards_stay_within_their_excursion(frequency: float) -> None:
-    """At the share for a board that deviates; at that for one as modelled most do not.
+    """At the share for a board that deviates; at that for one as modeled most do not.
 
     On boards drawn and integrated here, whose exciters jump in the phases that add.
     """
@@ -262,8 +262,8 @@ def test_lowest_modes_are_those_of_a_board_and_magnets_worked_out() -> None:
     modes = supported_modes(
         in_time(replace(rig, plate=stiff)).reduced, rig.eras, loads=rig.masses, frequency_max=100.0
     )
-    centre = np.abs(modes.at(np.array([[0.15, 0.115]]))[0])
-    found = modes.natural_frequencies[centre > 0.3 * centre.max()]
+    center = np.abs(modes.at(np.array([[0.15, 0.115]]))[0])
+    found = modes.natural_frequencies[center > 0.3 * center.max()]
     assert found[[0, -1]] == pytest.approx(sorted(heaves.real), rel=0.02)
     rigid = rigid_body_frequencies(stiff, rig.eras, loads=rig.masses)
     assert rigid[0] == pytest.approx(math.sqrt(foam / (board + magnets)) / (2 * math.pi), rel=0.02)

@@ -344,7 +344,7 @@ def value(A, b, x):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bounded_minimum_equals_a_general_optimiser(seed):
+def test_bounded_minimum_equals_a_general_optimizer(seed):
     """No bound is exceeded, and the value is that of SLSQP within 1 % of what is to be gained."""
     A, b = random_form(seed, 6)
     found = bounded_minimum(A, b.reshape(3, 2), np.eye(2)).ravel()

@@ -173,14 +173,14 @@ def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> N
             for one in drawn
         ]
     )
-    centres = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0, 1] + 17 * [0])
+    centers = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0, 1] + 17 * [0])
     spreads = np.array(
         [0.01, np.log(1.3), np.log(1.3), 0.2, 0.2, 0.2, 0.2, 0.4, 0.4, 0.02]
         + 8 * [0.3]
         + 8 * [0.1 * math.sqrt(0.5)]
         + [0.25]
     )
-    assert_allclose(found.mean(axis=0), centres, atol=0.15 * spreads.max(), rtol=0.01)
+    assert_allclose(found.mean(axis=0), centers, atol=0.15 * spreads.max(), rtol=0.01)
     assert_allclose(found.std(axis=0), spreads, rtol=0.1)
     alike = np.corrcoef(found.T) - np.eye(len(spreads))
     assert np.abs(alike).max() < 0.2

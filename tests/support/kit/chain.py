@@ -641,8 +641,8 @@ class Streamed(Chain):
     def _recorded(self, since: float, until: float) -> Recording:
         """Readings of the sensors in a window [s]."""
         records = self.far.bench.sample_fingers().felt(since, until)
-        centres = [records[name].accelerations[:, 0] for name in SENSORS]
-        return Recording(records["P1"].times, np.stack(centres, axis=1))
+        centers = [records[name].accelerations[:, 0] for name in SENSORS]
+        return Recording(records["P1"].times, np.stack(centers, axis=1))
 
     def _note_clocks(self, applied: PlayReport) -> None:
         """Keep how far off clocks are counted in what has just begun to play."""

@@ -682,10 +682,10 @@ Judged: TypeAlias = SimulatedAmplifier | Callable[[Callable[[bytes], None]], Far
 
 
 class JudgedLine:
-    """A line to an amplifier at address 1 and its neighbours; its client writes to it."""
+    """A line to an amplifier at address 1 and its neighbors; its client writes to it."""
 
     def __init__(
-        self, kind: str, far: Judged, neighbours: Mapping[int, SimulatedAmplifier] | None = None
+        self, kind: str, far: Judged, neighbors: Mapping[int, SimulatedAmplifier] | None = None
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
@@ -693,7 +693,7 @@ class JudgedLine:
         self.due = self._arrival = 0.0
         self._ticked: list[SimulatedAmplifier | FarEnd] = []
         if isinstance(far, SimulatedAmplifier):
-            known = {1: far, **(neighbours or {})}
+            known = {1: far, **(neighbors or {})}
             self._ticked += known.values()
             self._end = KINDS[kind].far_end(known, self.send)
         else:
@@ -765,7 +765,7 @@ def judged(
     level: float = DEFAULT_LEVEL,
     far: Judged | None = None,
     on_result: Callable[[CheckResult], None] = lambda result: None,
-    neighbours: Mapping[int, SimulatedAmplifier] | None = None,
+    neighbors: Mapping[int, SimulatedAmplifier] | None = None,
 ) -> list[CheckResult]:
     """Results of checks by name, all without names, in virtual time.
 
@@ -778,7 +778,7 @@ def judged(
     ]
 
     async def connected() -> JudgedLine:
-        return JudgedLine(kind, far or varied(), neighbours)
+        return JudgedLine(kind, far or varied(), neighbors)
 
     with (
         asyncio.Runner(loop_factory=VirtualLoop) as runner,

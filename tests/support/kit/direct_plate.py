@@ -1,6 +1,6 @@
 """Response of a plate on any mesh solved at each frequency, without modes: a reference.
 
-Of polynomials it is `model.spectral.direct_solution`; of finite elements one sparse factorisation
+Of polynomials it is `model.spectral.direct_solution`; of finite elements one sparse factorization
 for each frequency. What ERAs and loads do to the plate is computed here: from the motion of an
 ERA's base the force (k_b + i omega c) y of the founding paper's Eq. 25, and the dynamic stiffness
 of each; of an exciter by the equations of its magnet and of its current, solved beside each other.

@@ -484,7 +484,7 @@ class Hands(Acted, Fingers):
 
     @property
     def gained_nominal_db(self) -> float:
-        """How much more the first finger feels now than at the mark, as modelled [dB]."""
+        """How much more the first finger feels now than at the mark, as modeled [dB]."""
         now, before = felt(self.applied[-1])[1], felt(self.before)[1]
         return now.sensation.level_db_sl - before.sensation.level_db_sl
 
@@ -519,7 +519,7 @@ class Hands(Acted, Fingers):
 
     @property
     def beyond_nominal_db(self) -> dict[int, float]:
-        """By how much contrasts at fingertips are beyond those of contents, as modelled [dB]."""
+        """By how much contrasts at fingertips are beyond those of contents, as modeled [dB]."""
         contents = [one.content for one in self.applied[-1].contents.values()]
         said = {each.key.finger.id: each.sensations[0].contrast_db or 0.0 for each in contents}
         return {id: contrast - said[id] for id, contrast in self.contrasts().items()}

@@ -2,7 +2,7 @@
 
 Each is the board of examples/weekend/rig.yaml. Exciters, drives, board and feet are drawn within
 the uncertainty of the rig, force factors and magnets by 10 %. The sensor of
-examples/weekend/places.csv is put by hand: half a millimetre off, with a scale of its own at each
+examples/weekend/places.csv is put by hand: half a millimeter off, with a scale of its own at each
 place, and with noise. Everything is computed in memory, without a sound card.
 """
 

@@ -43,7 +43,7 @@ FIRMWARE = Path(__file__).parents[3] / "firmware"
 def build_firmware(folder: Path, program: str, *options: str) -> Path:
     """Build one of its programs into a folder, with options of make; return the folder.
 
-    Not optimised: compiling takes longer than all that tests play.
+    Not optimized: compiling takes longer than all that tests play.
     """
     goal = folder / program
     command = ["make", "-s", "-C", FIRMWARE, f"OUT={folder}", "CFLAGS=-O0", *options, goal]

@@ -298,7 +298,7 @@ async def network_management(subject: Subject) -> None:
     """
     client = cast(CanClient, subject.client)
     await client.look_around()
-    for_all = None if client.neighbours else 0
+    for_all = None if client.neighbors else 0
     for command, to, started_as in (
         ("pre_operational", None, for_all),
         ("stop", for_all, None),

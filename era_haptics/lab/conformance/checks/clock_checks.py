@@ -165,7 +165,7 @@ async def mark(subject: Subject) -> None:
     if client.has_broadcasts:
         await client.look_around()
     await subject.run([subject.arm, send("Mark"), send("Mark"), 0.1])
-    if client.has_broadcasts and not client.neighbours:
+    if client.has_broadcasts and not client.neighbors:
         sent_at = threads.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))
         written_at = threads.now()

@@ -31,10 +31,10 @@ async def damaged_frames(subject: Subject) -> None:
 
 
 async def _expect_one_address(subject: Subject) -> None:
-    """Raise ContractViolation if the amplifier replies at the address of a neighbour."""
+    """Raise ContractViolation if the amplifier replies at the address of a neighbor."""
     client = subject.client
     own_address = client.address
-    for address in client.neighbours:
+    for address in client.neighbors:
         client.address = address
         identity = await client.hello()
         is_other = identity != subject.identity

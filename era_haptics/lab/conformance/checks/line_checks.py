@@ -49,8 +49,8 @@ async def events(subject: Subject) -> None:
     client = subject.client
     require(client.has_events, "this wire carries no Events")
     await client.look_around()
-    has_neighbours = client.kind == "serial" and client.neighbours
-    has_events = subject.has("events") and not has_neighbours
+    has_neighbors = client.kind == "serial" and client.neighbors
+    has_events = subject.has("events") and not has_neighbors
     client.history.clear()
     await subject.arm(0.0)
     types = [message.type & _TYPE for message in client.history]
@@ -226,7 +226,7 @@ async def addresses(subject: Subject) -> None:
         await subject.request("SetAddress", **move)
         await asyncio.sleep(_MOVED)
         await _expect_moved(client, own_address)
-        if client.has_broadcasts and not client.neighbours:
+        if client.has_broadcasts and not client.neighbors:
             await _expect_moved_by_broadcast(client, own_address, serial_number)
     finally:
         is_back = await _move_back(subject, own_address, serial_number)

@@ -83,7 +83,7 @@ async def discarded_frames(subject: Subject) -> None:
 async def tolerated_frames(subject: Subject) -> None:
     """Frame in noise, in pieces or back to back: one reply to each.
 
-    Resynchronise at every zero byte, accept a zero shared by two frames, and buffer the next frame
+    Resynchronize at every zero byte, accept a zero shared by two frames, and buffer the next frame
     while you reply.
     """
     client = cast(SerialClient, subject.client)

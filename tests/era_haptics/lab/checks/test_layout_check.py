@@ -200,7 +200,7 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
     assert key["frequency_hz"] == [100.0]
     assert key["problems"] == []
     assert set(key["felt_db_sl"]) == {"min", "median", "max"}
-    # Nine of ten plates have less than the one that is modelled.
+    # Nine of ten plates have less than the one that is modeled.
     assert key["promised_contrast_db"]["median"] < key["felt_contrast_db"]["median"]
     assert 18 <= key["felt_db_sl"]["min"] <= key["felt_db_sl"]["max"] <= 22
     assert len(strip["problems"]) == 1  # its frequency

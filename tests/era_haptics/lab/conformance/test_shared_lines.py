@@ -24,7 +24,7 @@ NEXT, HIGHEST, PRE_OPERATIONAL = 2, {"can": 127}, 127
 GATEWAY_WAITS = 1.0  # s; for a unit that is not there
 
 
-class Neighbour(SimulatedAmplifier):
+class Neighbor(SimulatedAmplifier):
     """An amplifier that notes what it is asked to do; identities and objects are read without."""
 
     def __init__(self, name: str) -> None:
@@ -42,9 +42,9 @@ class Neighbour(SimulatedAmplifier):
         super().restart(now)
 
 
-def neighbours_of(kind: str) -> dict[int, Neighbour]:
+def neighbors_of(kind: str) -> dict[int, Neighbor]:
     """Return amplifiers at the next and at the highest address."""
-    return {each: Neighbour(f"at {each}") for each in (NEXT, HIGHEST.get(kind, 247))}
+    return {each: Neighbor(f"at {each}") for each in (NEXT, HIGHEST.get(kind, 247))}
 
 
 OTHER_ADDRESSES = [
@@ -67,8 +67,8 @@ OTHER_ADDRESSES = [
 def test_conforming_amplifier_passes_on_a_shared_line(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its neighbours get nothing, and nodes on CAN stay out of operation, by their heartbeats."""
-    others, beats, send = neighbours_of(kind), set[bytes](), JudgedLine.send
+    """Its neighbors get nothing, and nodes on CAN stay out of operation, by their heartbeats."""
+    others, beats, send = neighbors_of(kind), set[bytes](), JudgedLine.send
 
     def heard(line: JudgedLine, data: bytes) -> None:
         if kind == "can":
@@ -77,7 +77,7 @@ def test_conforming_amplifier_passes_on_a_shared_line(
         send(line, data)
 
     monkeypatch.setattr(JudgedLine, "send", heard)
-    results = judged(kind, names, neighbours=others)
+    results = judged(kind, names, neighbors=others)
     failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
     assert not failed, failed
     skipped = {each.check.name: each.reason for each in results if each.result == "skipped"}
@@ -131,7 +131,7 @@ class Gateway:
 
 def test_units_behind_one_gateway() -> None:
     """The gateway replies for absent units after a second, and lets what comes behind wait."""
-    others = neighbours_of("tcp")
+    others = neighbors_of("tcp")
     units: dict[int, SimulatedAmplifier] = {1: varied(), **others}
     names = ["identity", "obeys_in_time", "damaged_frames", "addresses"]
     results = judged("tcp", names, far=partial(Gateway, units))

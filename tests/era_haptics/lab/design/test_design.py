@@ -301,7 +301,7 @@ def test_static_loads_of_a_seesaw() -> None:
     weight = 9.80665 * some.plate.mass
     assert static_loads(some.plate, eras) == pytest.approx([weight / 4, weight / 4, weight / 2])
     assert shortfall(some, eras, lowest=10.0) == 0
-    # The centre of mass behind all of them: the plate tips.
+    # The center of mass behind all of them: the plate tips.
     assert shortfall(some, [replace(era, y=0.2 * era.y) for era in eras], lowest=1.0) > 0
     assert shortfall(some, eras, lowest=1e4) > 0
 

@@ -3,7 +3,8 @@
 from typing import Any
 
 from model.estimate.findings import ChannelVerdict, Finding, Verdict, cycles
-from model.estimate.plate_match import Hypothesis, Match
+from model.estimate.hypotheses import Hypothesis
+from model.estimate.plate_match import Match
 from model.quantities import percent
 from model.study.verification import MIN_KEPT_SHARE
 

@@ -18,15 +18,9 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from model.arrays import FloatArray, best_by, best_of, rms
-from model.estimate.plate_match import (
-    FALSE_ALARM,
-    MAX_FIT_ERROR,
-    Hypothesis,
-    Load,
-    Match,
-    linearized,
-    match_with_form,
-)
+from model.estimate.hypotheses import Hypothesis
+from model.estimate.load_search import Load, match_with_form
+from model.estimate.plate_match import FALSE_ALARM, MAX_FIT_ERROR, Match
 from model.quantities import counted, in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad
 
@@ -585,7 +579,7 @@ def _along_plate(match: Match) -> tuple[FloatArray, tuple[float, float]]:
     points = match.fit.measurement.points
     along = 2 * points / match.plate.sides - 1
     basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
-    shown = np.eye(len(points)) - linearized(match).stated_covariance[part, part]
+    shown = np.eye(len(points)) - match.linearized().stated_covariance[part, part]
     shown = basis.T @ shown @ basis + _MIN_SHOWN * np.eye(2)
     slope = basis.T @ match.fit.x[part]
     thinner = basis @ linalg.solve(shown, slope) * space.std[part]

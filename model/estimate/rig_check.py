@@ -27,6 +27,7 @@ from model.estimate.findings import (
     with_findings,
 )
 from model.estimate.gains import gains_of, row_rms
+from model.estimate.hypotheses import Hypothesis, compare_hypotheses
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Measurement,
@@ -45,17 +46,13 @@ from model.estimate.plate_match import (
     MAX_FIT_ERROR,
     MIN_COST_REDUCTION,
     MODEL_ERROR,
-    Hypothesis,
     Match,
-    ShapeMatch,
     best_wiring,
-    compared,
     likeliest,
     match_plate,
-    match_responses,
-    match_shapes,
 )
 from model.estimate.sensed_plate import SensedPlate, plate_of
+from model.estimate.shape_match import ShapeMatch, match_responses, match_shapes
 from model.rig.rig import Rig
 from model.structure.attachments import GRAVITY, Era, PointLoad
 from model.structure.exciter import Exciter
@@ -280,7 +277,7 @@ def _matched_verdict(
     if plate_matches:
         findings += tuple(beyond)
     else:
-        hypotheses = compared(nominal)
+        hypotheses = compare_hypotheses(nominal)
     fitted = likeliest([match, *(hypothesis.match for hypothesis in hypotheses)])
     loose = _behind_glue(fitted)
     if not plate_matches:

@@ -36,7 +36,7 @@ from kit.thin_plates import FAULTS, draw, measured_fault
 from kit.weekend_boards import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.estimate import plate_match
+from model.estimate import hypotheses
 from model.estimate.calibrate import calibrate
 from model.estimate.check_report import as_json, channel_table, verdict_rows
 from model.estimate.measurement import (
@@ -290,7 +290,7 @@ def solved_once():
         return solved[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plate_match, "sensed_plate", solve)
+        patch.setattr(hypotheses, "sensed_plate", solve)
         yield
 
 
@@ -518,7 +518,7 @@ def test_plate_of_another_length_is_refused_by_its_length(monkeypatch: pytest.Mo
         ("FITTED_HYPOTHESES", 3),
         ("REFINED_HYPOTHESES", 1),
     ):
-        monkeypatch.setattr(plate_match, name, few)
+        monkeypatch.setattr(hypotheses, name, few)
     true = perturbed(larger(PAPER, 1.2), frequencies=FREQUENCIES)
     with pytest.raises(InputError, match=r"plate\.length"):
         check_consistency(PAPER, measured_by_plates(true, frequencies=FREQUENCIES))

@@ -1,6 +1,7 @@
 """Formatting of quantities, shares, and numbers with their nouns."""
 
 import math
+from typing import NamedTuple
 
 _DISPLAY_UNITS = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
 
@@ -16,19 +17,19 @@ def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
     return f"{text} {shown_unit}".strip()
 
 
-def with_error(value: float, error: float, unit: str = "", *, sign: str = "") -> str:
-    """Format a value with its standard error to two digits: `74.02 ± 0.87 GPa`.
+class EstimateText(NamedTuple):
+    """Texts of a value, its standard error and their unit, as a string `74.02 ± 0.87 GPa`."""
 
-    See `error_parts`.
-    """
-    shown_value, shown_error, shown_unit = error_parts(value, error, unit, sign=sign)
-    return f"{shown_value} ± {shown_error} {shown_unit}".strip()
+    value: str
+    error: str
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.value} ± {self.error} {self.unit}".strip()
 
 
-def error_parts(
-    value: float, error: float, unit: str = "", *, sign: str = ""
-) -> tuple[str, str, str]:
-    """Format a value, its standard error to two digits, and their unit.
+def estimate_text(value: float, error: float, unit: str = "", *, sign: str = "") -> EstimateText:
+    """Format a value with its standard error to two digits.
 
     Units: see `in_display_unit`; sign: "+" also shows the sign of values above zero.
     """
@@ -36,10 +37,10 @@ def error_parts(
     value *= factor
     error *= factor
     if not (math.isfinite(error) and error > 0):
-        return f"{value:{sign}.5g}", f"{error:.2g}", shown_unit
+        return EstimateText(f"{value:{sign}.5g}", f"{error:.2g}", shown_unit)
     _, _, exponent = f"{error:.1e}".partition("e")
     decimals = max(0, 1 - int(exponent))
-    return f"{value:{sign}.{decimals}f}", f"{error:.{decimals}f}", shown_unit
+    return EstimateText(f"{value:{sign}.{decimals}f}", f"{error:.{decimals}f}", shown_unit)
 
 
 def percent(share: float) -> str:

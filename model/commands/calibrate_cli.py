@@ -135,14 +135,14 @@ def calibrate(
     Writes the fitted values to a separate file and prints them with their standard errors.
     """
     from model.estimate.calibrate import calibrate as fit
-    from model.estimate.calibration_result import calibration_errors
-    from model.estimate.fit_report import (
+    from model.estimate.calibration_report import (
         calibration_json,
         change_rows,
         check_rows,
         finding_rows,
         gain_rows,
     )
+    from model.estimate.calibration_result import calibration_errors
     from model.estimate.measurement import LEAST_SENSORS, measurement_of, read_measured
     from model.rig.rig_file import load_rig
 

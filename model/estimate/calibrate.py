@@ -21,8 +21,8 @@ from model.arrays import FloatArray, best_of
 from model.errors import InputError
 from model.estimate.calibration_result import MAX_PREDICTION_ERROR, Calibration
 from model.estimate.fit import JointPrior
-from model.estimate.forward import viscous_difference
 from model.estimate.gains import are_impossible
+from model.estimate.loss_law import viscous_difference
 from model.estimate.measurement import Measurement, check_enough_sensors
 from model.estimate.noise import fit_to_noise, without_outliers
 from model.estimate.parameters import PARAMETER_KINDS
@@ -94,8 +94,8 @@ def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) ->
     prior = _prior(plate, start, np.ones(len(scales), dtype=bool))
     searched = space.uncertain & ~space.of("gain")
     for _ in range(_LAW_ROUNDS):
-        law = viscous_difference(replace(plate, law=None), start)
-        plate = replace(plate, law=law)
+        change = viscous_difference(replace(plate, viscous_change=None), start)
+        plate = replace(plate, viscous_change=change)
         result = fit_to_noise(plate, measurement, searched=searched, start=start, prior=prior)
         measurement = result.measurement
         start = result.x

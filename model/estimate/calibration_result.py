@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, Point, rms
 from model.config.document import KeyPath
 from model.estimate.fit import HELD_OUT_FOLDS, Fit, JointPrior, fit
-from model.estimate.forward import MASS_CELLS, jacobian
 from model.estimate.gains import gains_of, row_rms
 from model.estimate.measurement import LEAST_SENSORS, Measurement
 from model.estimate.noise import fit_to_noise
-from model.estimate.parameters import FORM_ERRORS, PARAMETER_KINDS
+from model.estimate.parameters import FORM_ERRORS, MASS_CELLS, PARAMETER_KINDS, jacobian
 from model.estimate.sensed_plate import Parameter, SensedPlate, errors_by_key
 from model.files.csv_file import as_frame
 from model.rig.rig import Rig, Uncertainty
@@ -349,7 +348,7 @@ class Calibration:
     @cached_property
     def _fields(self) -> ComplexArray:
         """Responses of the rig without form errors and gains (f, s, eras) [1/s²]."""
-        plain = replace(self.plate, form=None, law=None)
+        plain = replace(self.plate, form=None, viscous_change=None)
         return plain.with_rig(self._fitted).responses()
 
     @cached_property
@@ -382,7 +381,8 @@ class Calibration:
         """Relative model error of the loss factor, including the effect of all dampers."""
         plate = self.plate
         kinds = np.array([parameter.kind for parameter in plate.parameters])
-        values = plate.values(self.fit.x) / plate.space.scale[plate.numbers]
+        std = plate.space.std[plate.numbers]
+        values = plate.values(self.fit.x) / np.where(std > 0, std, 1.0)
         size = np.where(values > 0, values, np.inf)
         covariance = self.fit.covariance[np.ix_(plate.numbers, plate.numbers)]
         relative = covariance / np.outer(size, size)

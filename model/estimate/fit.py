@@ -19,9 +19,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, best_by, best_first
-from model.estimate.forward import ForwardModel, PlateAt, Space, by_mass_at, jacobian
+from model.estimate.derivatives import ResponseDerivatives
+from model.estimate.forward import ForwardModel, PlateAt
 from model.estimate.gains import best_gains, gain_residuals
 from model.estimate.measurement import Measurement
+from model.estimate.parameter_space import Space
+from model.estimate.parameters import jacobian
 
 HELD_OUT_FOLDS = 5
 """One in this many paths or sensors is held out."""
@@ -137,7 +140,7 @@ class Fit(Generic[ModelT]):
         factor (f,): effect of a load of size 1 relative to 1 kg, default 1; std: prior standard
         error of the size, which must be positive to count.
         """
-        load_slopes = by_mass_at(self.fitted_plate, points)
+        load_slopes = ResponseDerivatives(self.fitted_plate).mass_at(points)
         if factor is not None:
             load_slopes = load_slopes * factor[:, None, None, None]
         driven = self.measurement.driven

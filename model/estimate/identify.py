@@ -28,12 +28,13 @@ from model.arrays import FloatArray, best_of, rms
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.fit import HELD_OUT_FOLDS, fit
-from model.estimate.forward import ForwardModel, PlateAt, PlateValues, Sensor, Space, jacobian
+from model.estimate.forward import ForwardModel, PlateAt, Sensor
 from model.estimate.gains import are_impossible
 from model.estimate.measurement import Measurement
-from model.estimate.parameters import PARAMETER_KINDS
+from model.estimate.parameter_space import PlateValues, Space
+from model.estimate.parameters import PARAMETER_KINDS, jacobian
+from model.estimate.rig_parameters import rig_with
 from model.estimate.sensed_plate import errors_by_key, parameters_of
-from model.estimate.space import rig_with
 from model.estimate.staged_fit import RigFit, fit_board, mode_shift, model_of
 from model.processes import Progress, unseen
 from model.rig.rig import Rig, Uncertainty

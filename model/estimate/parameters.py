@@ -14,25 +14,30 @@ compares every derivative with a difference quotient.
 """
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.forward import (
-    MASS_CELLS,
-    MIN_LOSS_FACTOR,
+from model.estimate.derivatives import ResponseDerivatives
+from model.estimate.forward import MIN_LOSS_FACTOR, PlateAt
+from model.estimate.parameter_space import (
     ParameterKind,
     ParameterValues,
-    PlateAt,
     PlateValues,
     Prior,
     SearchScope,
     values_of_eras,
 )
+from model.finger import Grid
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FEET_DEVIATE, damping_from_ratio
 from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_EXPONENT, MAX_LOSS_FACTOR
+
+MASS_CELLS = Grid(8, 6)
+"""Possible positions of foreign mass."""
 
 _COIL_MASS_STD = 0.2
 """Assumed standard deviation of a coil mass from a data sheet, relative."""
@@ -46,7 +51,15 @@ _MIN_LOSS_STD = 0.7
 # Base classes: names of parameters, and priors that several kinds share.
 
 
-class StatedByRig(ParameterKind):
+class DifferentiableKind(ParameterKind):
+    """A kind of parameters with derivatives of the responses."""
+
+    @abstractmethod
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        """Derivatives of the responses by all m parameters (f, s, n, m)."""
+
+
+class StatedByRig(DifferentiableKind):
     """A kind whose name is also the key of its standard deviation in the rig's `uncertainty`."""
 
     def prior(self, scope: SearchScope) -> Prior:
@@ -54,35 +67,35 @@ class StatedByRig(ParameterKind):
         return Prior(std)
 
 
-class PlateParameter(ParameterKind):
+class PlateParameter(DifferentiableKind):
     """Kind with a single parameter."""
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [self.label]
 
 
-class EraParameter(ParameterKind):
+class EraParameter(DifferentiableKind):
     """Kind with one parameter per ERA."""
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {era}" for era in scope.eras]
 
 
-class SensorParameter(ParameterKind):
+class SensorParameter(DifferentiableKind):
     """Kind with one parameter per sensor."""
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {sensor}" for sensor in scope.sensors]
 
 
-class ModeParameter(ParameterKind):
+class ModeParameter(DifferentiableKind):
     """Kind with one parameter for each of the lowest elastic modes."""
 
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {n}" for n in range(1, scope.mode_count + 1)]
 
 
-class FormError(ParameterKind):
+class FormError(DifferentiableKind):
     """Kind that exists only on plates with form errors, exactly known for an installed rig."""
 
     def names(self, scope: SearchScope) -> Sequence[str]:
@@ -106,8 +119,8 @@ class EraFactor(EraParameter):
         factors = np.exp(values.deviations(self.name))
         return values_of_eras(values.rig, self.name) * factors
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_sources(self.name)
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.era_values(self.name)
 
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         std = max(self.std, scope.rig.uncertainty.stiffness)
@@ -145,9 +158,8 @@ class ThicknessFactor(StatedByRig, PlateParameter):
     def value(self, values: PlateValues) -> float:
         return values.factor(self.name)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        by_mass = plate.responding(plate.by_free(plate.free_receptance))[..., None]
-        return 2 * plate.by_log_rigidity - by_mass
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return 2 * derivatives.rigidity - derivatives.free_receptance
 
 
 class ModulusFactor(PlateParameter):
@@ -167,8 +179,8 @@ class ModulusFactor(PlateParameter):
     def value(self, values: PlateValues) -> float:
         return values.factor(self.name)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_log_rigidity
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.rigidity
 
 
 class LossFactor(PlateParameter):
@@ -189,8 +201,8 @@ class LossFactor(PlateParameter):
         added = values.deviations("loss_added")[0]
         return float(np.clip(scaled + added, 0.0, MAX_LOSS_FACTOR))
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_log_loss
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.loss_factor
 
 
 class LossAdded(PlateParameter):
@@ -206,8 +218,9 @@ class LossAdded(PlateParameter):
         loss_factor = scope.rig.plate.loss_factor
         return _added_prior(loss_factor, std=max(_MIN_LOSS_STD * loss_factor, 0.003), largest=0.5)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return np.asarray(plate.by_log_loss / max(plate.values["loss"], MIN_LOSS_FACTOR))
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        loss_factor = derivatives.plate.values["loss"]
+        return np.asarray(derivatives.loss_factor / max(loss_factor, MIN_LOSS_FACTOR))
 
 
 class LossExponent(PlateParameter):
@@ -227,9 +240,9 @@ class LossExponent(PlateParameter):
     def value(self, values: PlateValues) -> float:
         return float(values.rig.plate.loss_exponent + values.deviations(self.name)[0])
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        log_frequency = np.log(plate.model.frequencies / LOSS_FREQUENCY)
-        return log_frequency[:, None, None, None] * plate.by_log_loss
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        log_frequency = np.log(derivatives.plate.model.frequencies / LOSS_FREQUENCY)
+        return log_frequency[:, None, None, None] * derivatives.loss_factor
 
 
 class ModeStiffness(ModeParameter):
@@ -243,8 +256,8 @@ class ModeStiffness(ModeParameter):
     def datasheet_prior(self, scope: SearchScope) -> Prior:
         return Prior(0.003)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_modes(1.0)
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.mode_stiffness
 
 
 class ModeLoss(ModeParameter):
@@ -257,8 +270,8 @@ class ModeLoss(ModeParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return _loss_prior(scope, self.std)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_modes(plate.by_mode_loss)
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.mode_losses
 
 
 # ERAs and their drives.
@@ -296,8 +309,8 @@ class Damping(PlateParameter):
         scaled = values_of_eras(values.rig, "damping") * np.exp(log_factors)
         return np.maximum(scaled + values.deviations("damping_added"), 0.0)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return np.asarray(_by_log_damping(plate).sum(axis=-1, keepdims=True))
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return np.asarray(_log_damping_derivatives(derivatives).sum(axis=-1, keepdims=True))
 
 
 class DampingOfEra(EraParameter):
@@ -312,8 +325,8 @@ class DampingOfEra(EraParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return Prior(self.std * _uncertain_damping(scope))
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return _by_log_damping(plate)
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return _log_damping_derivatives(derivatives)
 
 
 class DampingAdded(EraParameter):
@@ -342,8 +355,8 @@ class DampingAdded(EraParameter):
         damping = values_of_eras(rig, "damping")
         return _added_prior(damping, std=_MIN_LOSS_STD * damping, largest=2.0 * critical_damping)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_sources("damping")
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.era_values("damping")
 
 
 class DriveGain(StatedByRig, EraParameter):
@@ -361,8 +374,8 @@ class DriveGain(StatedByRig, EraParameter):
         """Complex factor on each gain, with the phase of `DrivePhase`."""
         return np.exp(values.deviations("gain") + 1j * values.deviations("phase"))
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_drives()
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.drive_gains()
 
 
 class DrivePhase(EraParameter):
@@ -378,8 +391,8 @@ class DrivePhase(EraParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return Prior(math.radians(scope.uncertainty.phase_deg))
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_drives(1j)
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.drive_gains(1j)
 
 
 class DriveInertia(EraParameter):
@@ -396,9 +409,10 @@ class DriveInertia(EraParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return _lag_prior(scope, self.std)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        kilohertz = 1e-3 * plate.model.frequencies[:, None]
-        return plate.by_drives((kilohertz**2 * plate.lag)[:, None, None])
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        kilohertz = 1e-3 * derivatives.plate.model.frequencies[:, None]
+        factor = kilohertz**2 * derivatives.plate.lag
+        return derivatives.drive_gains(factor[:, None, None])
 
 
 class DriveDrag(EraParameter):
@@ -415,9 +429,10 @@ class DriveDrag(EraParameter):
     def prior(self, scope: SearchScope) -> Prior:
         return _lag_prior(scope, self.std)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        kilohertz = 1e-3 * plate.model.frequencies[:, None]
-        return plate.by_drives((-1j * kilohertz * plate.lag)[:, None, None])
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        kilohertz = 1e-3 * derivatives.plate.model.frequencies[:, None]
+        factor = -1j * kilohertz * derivatives.plate.lag
+        return derivatives.drive_gains(factor[:, None, None])
 
 
 class BoltMass(EraParameter):
@@ -448,8 +463,8 @@ class BoltMass(EraParameter):
         added = values.deviations(self.name)
         return np.maximum(values_of_eras(values.rig, self.name) + added, 0.0)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_sources("bolt_mass")
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.era_values("bolt_mass")
 
 
 class MagnetMass(ExciterFactor):
@@ -470,7 +485,7 @@ class ForceFactor(ExciterFactor):
     largest_factor = math.inf
 
 
-class EraLocation(ParameterKind):
+class EraLocation(DifferentiableKind):
     """x and y of each ERA, relative to the rig's [m].
 
     On a plate with form errors an ERA can leave the plate, whose mode shapes are continued
@@ -500,14 +515,14 @@ class EraLocation(ParameterKind):
         positions = np.array([(era.x, era.y) for era in values.rig.eras])
         return positions + values.deviations(self.name).reshape(-1, 2)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_places[..., : 2 * len(plate.sources)]
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.positions[..., : 2 * len(derivatives.plate.sources)]
 
 
 # Other attachments of the plate
 
 
-class AddedMasses(ParameterKind):
+class AddedMasses(DifferentiableKind):
     """Additional masses [kg], each with x and y from the middle of the plate [m]."""
 
     name = "masses"
@@ -537,8 +552,8 @@ class AddedMasses(ParameterKind):
         masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
         return masses
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_masses()
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.added_masses
 
 
 class FootStiffness(StatedByRig):
@@ -557,9 +572,11 @@ class FootStiffness(StatedByRig):
     def value(self, values: PlateValues) -> FloatArray:
         return np.exp(values.deviations(self.name))
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        plate = derivatives.plate
         feet = len(plate.sources) + np.array(plate.model.rig.feet, dtype=int)
-        return plate.by_stiffness(feet, plate.values[self.name] * plate.model.springs)
+        springs = plate.values[self.name] * plate.model.foot_springs
+        return derivatives.attachment_stiffness(feet, springs)
 
 
 # Sensors.
@@ -577,8 +594,8 @@ class SensorGain(SensorParameter):
         """Complex factor on each gain, with the phase of `SensorPhase`."""
         return np.exp(values.deviations("sensor_gain") + 1j * values.deviations("sensor_phase"))
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_sensors
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.sensor_gains
 
 
 class SensorPhase(SensorParameter):
@@ -591,8 +608,8 @@ class SensorPhase(SensorParameter):
     per_unit = math.degrees(1)
     stage = 0
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return 1j * plate.by_sensors
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return 1j * derivatives.sensor_gains
 
 
 # Form errors, which no rig file describes: inaccurate cutting, positions, and attached cables
@@ -612,9 +629,10 @@ class SensorScale(FormError):
         errors = values.deviations(self.name)
         return 1 + errors if errors.size else 1.0
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        plate = derivatives.plate
         gain = plate.values["sensor_gain"][:, None]
-        unscaled = gain * plate.drive[:, None] * plate.seen
+        unscaled = gain * plate.drive[:, None] * plate.sensed_receptance
         return np.asarray(unscaled[..., None] * np.eye(len(plate.model.sensors))[:, None])
 
 
@@ -632,9 +650,10 @@ class SensorPosition(FormError):
     def value(self, values: PlateValues) -> FloatArray:
         return values.deviations(self.name).reshape(-1, 2)
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        before = len(plate.sources) + plate.model.mass_count
-        return plate.by_places[..., 2 * before :]
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        plate = derivatives.plate
+        first = len(plate.sources) + plate.model.mass_count
+        return derivatives.positions[..., 2 * first :]
 
 
 class ForeignMass(FormError):
@@ -653,8 +672,8 @@ class ForeignMass(FormError):
         shares = values.deviations(self.name)
         return np.asarray(shares - shares.mean())
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_foreign_mass()
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.foreign_mass
 
 
 class SideLength(FormError):
@@ -673,8 +692,8 @@ class SideLength(FormError):
         plate = values.rig.plate
         return values.deviations(self.name) / [plate.length, plate.width]
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_stretch(0, 1) / plate.model.sides
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.stretch(0, 1) / derivatives.plate.model.sides
 
 
 class PoissonRatio(FormError):
@@ -686,12 +705,12 @@ class PoissonRatio(FormError):
     unit = ""
     per_unit = 1.0
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        return plate.by_stretch(2)
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        return derivatives.stretch(2)
 
 
 class LossLaw(FormError):
-    """Law of losses, from hysteretic (0) to viscous (1); see `model.estimate.forward`."""
+    """Law of losses, from hysteretic (0) to viscous (1); see `model.estimate.loss_law`."""
 
     name = "loss_law"
     label = "loss law"
@@ -702,12 +721,12 @@ class LossLaw(FormError):
     def value(self, values: PlateValues) -> float:
         return float(values.deviations(self.name).sum())
 
-    def derivative(self, plate: PlateAt) -> ComplexArray:
-        law = 0.0 if plate.model.law is None else plate.model.law
-        return (plate.scale * law)[..., None]
+    def derivative(self, derivatives: ResponseDerivatives) -> ComplexArray:
+        change = derivatives.plate.model.viscous_change
+        return (derivatives.plate.scale * (0.0 if change is None else change))[..., None]
 
 
-ALL_KINDS: tuple[ParameterKind, ...] = (
+ALL_KINDS: tuple[DifferentiableKind, ...] = (
     ThicknessFactor(),
     ModulusFactor(),
     Stiffness(),
@@ -740,11 +759,28 @@ ALL_KINDS: tuple[ParameterKind, ...] = (
 )
 """All kinds of parameters, in the order in which a space lists them."""
 
-PARAMETER_KINDS: dict[str, ParameterKind] = {kind.name: kind for kind in ALL_KINDS}
+PARAMETER_KINDS: dict[str, DifferentiableKind] = {kind.name: kind for kind in ALL_KINDS}
 """All kinds of parameters by name."""
 
 FORM_ERRORS = tuple(kind.name for kind in ALL_KINDS if isinstance(kind, FormError))
 """Names of the kinds that only a plate with form errors has."""
+
+
+def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> ComplexArray:
+    """Derivatives of the responses of a plate by x, (f, s, n, p).
+
+    searched (p,): mask of the requested parameters, default all; kinds without any get zeros.
+    """
+    space = plate.model.space
+    is_requested = space.uncertain
+    if searched is not None:
+        is_requested = is_requested & searched
+    derivatives = ResponseDerivatives(plate)
+    slopes = np.zeros((*plate.responses.shape, space.size), dtype=complex)
+    for name, part in space.groups.items():
+        if is_requested[part].any():
+            slopes[..., part] = PARAMETER_KINDS[name].derivative(derivatives) * space.std[part]
+    return slopes
 
 
 def _added_prior(
@@ -781,6 +817,6 @@ def _uncertain_damping(scope: SearchScope) -> FloatArray:
     return (is_damped & (scope.uncertainty.damping > 1)).astype(float)
 
 
-def _by_log_damping(plate: PlateAt) -> ComplexArray:
+def _log_damping_derivatives(derivatives: ResponseDerivatives) -> ComplexArray:
     """Derivatives by the logarithm of the damping of each ERA (f, s, n, n)."""
-    return np.asarray(plate.by_sources("damping") * plate.values["damping"])
+    return np.asarray(derivatives.era_values("damping") * derivatives.plate.values["damping"])

@@ -9,16 +9,35 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.config.document import KeyPath
-from model.estimate.forward import MASS_CELLS, ForwardModel, PlateValues, Sensor
+from model.estimate.forward import ForwardModel, Sensor
 from model.estimate.measurement import Measurement
-from model.estimate.parameters import PARAMETER_KINDS
-from model.estimate.space import MAX_GUESSED, VALUE_UNITS, rig_with, space_from_datasheets
+from model.estimate.parameter_space import PlateValues
+from model.estimate.parameters import MASS_CELLS, PARAMETER_KINDS
+from model.estimate.rig_parameters import rig_with, space_from_datasheets
 from model.reduction.form_modes import reduced_modes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.actuator_keys import ACTUATOR_KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import check_is_plate
+
+MAX_GUESSED = math.sqrt(0.5)
+"""Standard error of a parameter relative to its prior, above which the prior determines it more
+than the data do."""
+
+VALUE_UNITS = {
+    "length": "m",
+    "width": "m",
+    "thickness": "m",
+    "modulus": "Pa",
+    "loss_factor": "",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "bolt_mass": "kg",
+    "magnet_mass": "kg",
+    "supports": "N/m",
+}
+"""Units of the values of a rig that parameters change."""
 
 # Limits for modes that can shift: of the lowest bending frequency, of the highest tone.
 _LOWEST, _HIGHEST = 0.1, 1.2

@@ -24,10 +24,11 @@ import numpy as np
 
 from model.arrays import FloatArray, ranked_by, rms
 from model.estimate.fit import Fit, fit, likeliest_fit
-from model.estimate.forward import MODE_SHIFTS, ForwardModel, Sensor
+from model.estimate.forward import ForwardModel, Sensor
 from model.estimate.measurement import Measurement
+from model.estimate.parameter_space import MODE_SHIFTS
 from model.estimate.parameters import PARAMETER_KINDS
-from model.estimate.space import inwards, plate_with, space_of
+from model.estimate.rig_parameters import inwards, plate_with, space_of
 from model.finger import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig

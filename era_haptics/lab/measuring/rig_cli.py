@@ -145,7 +145,7 @@ def _identify_measured(
     """Fit a rig to a measurement, write the fitted rig if it explains it, and print the report."""
     import time
 
-    from model.estimate import fit_report
+    from model.estimate import identification_report
     from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, identification_errors
     from model.study.expected_contrast import expected_contrast
 
@@ -157,9 +157,9 @@ def _identify_measured(
     rows = [
         _measured_line(rig, measured),
         *measured.notes,
-        *fit_report.parameter_rows(identification),
-        *fit_report.fit_rows(identification),
-        *fit_report.contrast_rows(expected),
+        *identification_report.parameter_rows(identification),
+        *identification_report.fit_rows(identification),
+        *identification_report.contrast_rows(expected),
     ]
     files = []
     refusal: str | None = None
@@ -182,7 +182,8 @@ def _identify_measured(
         )
     report: dict[str, Any] | None = None
     if as_json:
-        report = fit_report.identification_json(identification, expected) | _measured_json(measured)
+        report = identification_report.identification_json(identification, expected)
+        report |= _measured_json(measured)
     elapsed = time.perf_counter() - started
     finish(rows, report, files=files, elapsed=elapsed, refusal=refusal)
 

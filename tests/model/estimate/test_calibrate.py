@@ -26,8 +26,8 @@ from kit.weekend_boards import FOLDER, measured_board
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.fit_report import calibration_json, change_rows, finding_rows
-from model.estimate.forward import viscous_difference
+from model.estimate.calibration_report import calibration_json, change_rows, finding_rows
+from model.estimate.loss_law import viscous_difference
 from model.estimate.measurement import sensors_at
 from model.estimate.sensed_plate import SensedPlate, sensed_plate
 from model.rig.rig import Rig

@@ -19,15 +19,12 @@ from kit.thin_plates import Hidden, draw, parameters_held
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
-from model.estimate.fit_report import fit_rows, identification_json, parameter_rows
 from model.estimate.forward import (
     SENSOR_FOOT,
     ForwardModel,
-    PlateValues,
     Sensor,
-    Space,
-    jacobian,
 )
+from model.estimate.identification_report import fit_rows, identification_json, parameter_rows
 from model.estimate.identify import (
     MAX_CHI2,
     Identification,
@@ -35,7 +32,9 @@ from model.estimate.identify import (
     identify,
 )
 from model.estimate.measurement import Measurement, Repeat
-from model.estimate.space import inwards, rig_with, space_of
+from model.estimate.parameter_space import PlateValues, Space
+from model.estimate.parameters import jacobian
+from model.estimate.rig_parameters import inwards, rig_with, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig

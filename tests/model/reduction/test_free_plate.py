@@ -20,8 +20,8 @@ from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.rig_parameters import space_of
 from model.estimate.sensed_plate import sensed_plate
-from model.estimate.space import space_of
 from model.fem import ELEMENTS, MITC4, Mesh, PlateMatrices, assemble
 from model.finger import Grid
 from model.reduction import free_plate

@@ -12,33 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from model.arrays import FloatArray
-from model.estimate.forward import MODE_SHIFTS, PlateValues, Prior, SearchScope, Space
-from model.estimate.parameters import ALL_KINDS, PARAMETER_KINDS
+from model.estimate.parameter_space import MODE_SHIFTS, PlateValues, SearchScope, Space
+from model.estimate.parameters import PARAMETER_KINDS
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain, PointLoad
 from model.structure.exciter import Actuator
 from model.structure.plate import LOSS_FREQUENCY, Plate
-
-UNIT_KEYS = {"%": "percent", "°": "deg", "/kHz²": "1/kHz^2", "/kHz": "1/kHz"}
-"""Units in JSON reports, where these differ from the units in printed reports."""
-
-MAX_GUESSED = math.sqrt(0.5)
-"""Standard error of a parameter relative to its prior, above which the prior determines it more
-than the data do."""
-
-VALUE_UNITS = {
-    "length": "m",
-    "width": "m",
-    "thickness": "m",
-    "modulus": "Pa",
-    "loss_factor": "",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "bolt_mass": "kg",
-    "magnet_mass": "kg",
-    "supports": "N/m",
-}
-"""Units of the values of a rig that parameters change."""
 
 _AT_EDGE = 1e-6  # m
 _MIN_MASS = 1e-5  # kg; a lighter one is not written to a rig
@@ -60,12 +39,7 @@ def space_of(
     error.
     """
     scope = SearchScope(rig, sensors, uncertainty, drives_lag, masses, mode_count)
-    space = Space.empty(PARAMETER_KINDS)
-    for kind in ALL_KINDS:
-        names = kind.names(scope)
-        prior = kind.prior(scope) if names else Prior(0.0)
-        space = space.extended(kind, names, prior)
-    return space
+    return Space.from_kinds(PARAMETER_KINDS, scope)
 
 
 def space_from_datasheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) -> Space:
@@ -81,12 +55,7 @@ def space_from_datasheets(rig: Rig, sensors: Sequence[str], form_modes: int | No
         mode_count=form_modes or 0,
         form_of=None if form_modes is None else len(sensors),
     )
-    space = Space.empty(PARAMETER_KINDS)
-    for kind in ALL_KINDS:
-        names = kind.names(scope)
-        prior = kind.datasheet_prior(scope) if names else Prior(0.0)
-        space = space.extended(kind, names, prior)
-    return space
+    return Space.from_kinds(PARAMETER_KINDS, scope, from_datasheets=True)
 
 
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:

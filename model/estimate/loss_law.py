@@ -11,7 +11,7 @@ supports with natural frequencies w_j, viscous losses are
 
     i eta w C,    C = sum_jk M psi_j (psi_j^T K_l psi_k) psi_k^T M / sqrt(w_j w_k),
 
-which equals i eta K_l for a single mode at its resonance (see `model.reduction.reduced_plate`).
+which equals i eta K_l for a single mode at its resonance (see `model.reduction.supported_plate`).
 """
 
 from dataclasses import replace

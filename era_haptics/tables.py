@@ -37,8 +37,8 @@ def table(
 ) -> LocalizationTable:
     """Return the rig's localization table from the user's cache, or build it in a second or two.
 
-    - drive_mode: default of later queries, `phased` (any levels and phases) or, for amplifiers that
-      cannot set phases, `switched` (one or two ERAs without phases, one vibration at a time).
+    - drive_mode: default of later queries: `phased`, or for amplifiers that cannot set phases
+      another mode (`era table build --help` lists them).
     - frequencies (f,) [Hz]: ascending, within the rig's limits; default: 40 to 500 in steps of 10,
       as far as the limits allow.
     - grid: target cells.

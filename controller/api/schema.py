@@ -186,7 +186,7 @@ class TableSummary(ApiMessage):
     fingerprint: str
     """identifies the plate and ERAs it was built for"""
     mode: str
-    """switched or phased"""
+    """drive mode, such as phased"""
     frequencies_hz: list[float]
     cells_x: Count
     cells_y: Count

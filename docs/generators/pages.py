@@ -28,6 +28,7 @@ from findings_page import finding_kinds
 from firmware_header import header
 from firmware_records import records_header
 from metrics_page import metrics
+from model.drive_modes import drive_mode_table
 from page_names import wrong_names
 from processes import error_cases
 from protocol_bytes import BYTES
@@ -108,6 +109,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
         part("docs/generators/metrics_page.py", metrics),
         *_parts("protocol_tables.py", TABLES["metrics"]),
     ],
+    "docs/concepts/localization.md": [part("model/drive_modes.py", drive_mode_table)],
     "docs/reference/python-api.md": [with_entries],
     "docs/reference/errors.md": [error_cases.with_messages],
     "docs/reference/rig.md": _parts("rig_page.py", rig_page.PARTS),

@@ -385,7 +385,7 @@ export interface RigSummary {
 export interface TableSummary {
   /** identifies the plate and ERAs it was built for */
   fingerprint: string;
-  /** switched or phased */
+  /** drive mode, such as phased */
   mode: string;
   frequencies_hz: Array<number>;
   cells_x: number;

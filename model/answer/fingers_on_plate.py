@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
-from model.drive_modes import Forms, WeightedTones
+from model.drive_forms import Forms, WeightedTones
 from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import Drawing, over_fingertips
 from model.ensemble.expected_power import outer

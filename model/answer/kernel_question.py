@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from model import drive_modes
+from model import phased_weights
 from model.answer.fingers_on_plate import (
     CENTER_AND_RIM,
     MAX_FINGERS_BY_POINT,
@@ -40,7 +40,8 @@ from model.compiled.kernels import (
     WeightSearch,
     run_kernel,
 )
-from model.drive_modes import LEVEL_MARGIN, UNRESTRICTED
+from model.drive_forms import LEVEL_MARGIN
+from model.drive_modes import UNRESTRICTED
 from model.ensemble.draws import JUDGING_DRAWS, PERCENTILE, PROMISED_DRAWS
 from model.ensemble.expected_power import RIDGE
 from model.ensemble.kernel_plates import draws_structure, plates_structure
@@ -251,16 +252,16 @@ def _packed_rules(table: LocalizationTable) -> Rules:
         gain_variance=gain_variance,
         ridge=RIDGE,
         margin=LEVEL_MARGIN,
-        highest=drive_modes.NEARLY_HIGHEST,
+        highest=phased_weights.NEARLY_HIGHEST,
         reached=REACHED,
         judged=PERCENTILE,
         promised=PROMISED_PERCENTILE,
-        starts=drive_modes.TARGET_STARTS,
-        iterations=drive_modes.ALIGNMENTS,
-        again=drive_modes.REALIGNMENTS,
-        one_finger=_packed_method(drive_modes.ONE_FINGER),
-        several=_packed_method(drive_modes.SEVERAL),
-        within=(WeightSearch * 3)(*map(_packed_method, drive_modes.WITHIN_STROKE)),
+        starts=phased_weights.TARGET_STARTS,
+        iterations=phased_weights.ALIGNMENTS,
+        again=phased_weights.REALIGNMENTS,
+        one_finger=_packed_method(phased_weights.ONE_FINGER),
+        several=_packed_method(phased_weights.SEVERAL),
+        within=(WeightSearch * 3)(*map(_packed_method, phased_weights.WITHIN_STROKE)),
         groups=1 + max(groups, default=0),
         sets=len(table.threshold_sets),
     )
@@ -281,14 +282,14 @@ def _packed_rules(table: LocalizationTable) -> Rules:
     return rules
 
 
-def _packed_method(method: drive_modes.LawsonMethod) -> WeightSearch:
+def _packed_method(method: phased_weights.LawsonMethod) -> WeightSearch:
     """Pack the parameters of the search for weights."""
     return WeightSearch(
         steps=method.steps,
         limited=method.is_limited,
         variance=method.variance,
         gain=method.gain,
-        reserve=drive_modes.LEVEL_RESERVE,
-        growth=drive_modes.MAX_GROWTH,
-        most=drive_modes.MAX_MULTIPLIER,
+        reserve=phased_weights.LEVEL_RESERVE,
+        growth=phased_weights.MAX_GROWTH,
+        most=phased_weights.MAX_MULTIPLIER,
     )

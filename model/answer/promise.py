@@ -17,7 +17,7 @@ from model.answer.fingers_on_plate import DriveTones, FingersOnPlate
 from model.answer.question import PROMISED_PERCENTILE, Contents, Tones
 from model.answer.ringing import RingingUnderFingers, on_drawn_plates
 from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray
-from model.drive_modes import WeightedTones
+from model.drive_forms import WeightedTones
 from model.ensemble.draws import PROMISED_DRAWS, percentile
 from model.finger import decibels
 from model.table.table import LocalizationTable

@@ -10,7 +10,7 @@ import numpy as np
 from model.answer.envelope import DriveEnvelope, OverDuration
 from model.answer.question import Contents
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
-from model.drive_modes import Forms, WeightedTones
+from model.drive_forms import Forms, WeightedTones
 from model.finger import detection_threshold
 from model.structure.attachments import fingertip_loads
 from model.table.table import LocalizationTable, read_fingertips

@@ -2,7 +2,7 @@
 
 `choose_by_numpy` is the reference for the kernel. It handles questions that the kernel does not
 support (durations, envelopes, avoided frequencies, the drive mode `switched`), and computers
-without the kernel. `model.drive_modes` finds candidates for each content, drawn plates decide
+without the kernel. `_SEARCHES` finds candidates for each content, drawn plates decide
 between them, and the best combination is promised.
 """
 
@@ -33,20 +33,17 @@ from model.arrays import (
     best_of,
 )
 from model.compiled.kernels import kernels
-from model.drive_modes import (
+from model.drive_forms import Forms, WeightedTones
+from model.ensemble.draws import JUDGING_DRAWS, percentile
+from model.finger import decibels
+from model.phased_weights import (
     NEARLY_HIGHEST,
-    UNRESTRICTED,
     CoherentResult,
-    Forms,
-    WeightedTones,
-    find_switched,
-    max_sensation_switched,
     search,
     search_all,
     search_to_level,
 )
-from model.ensemble.draws import JUDGING_DRAWS, percentile
-from model.finger import decibels
+from model.switched_patterns import find_switched, max_sensation_switched
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_BY_POINT = 8
@@ -130,10 +127,7 @@ def choose_by_numpy(
     """
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     ringing = RingingUnderFingers.of_streams(table, contents)
-    if contents.drive_mode == UNRESTRICTED:
-        candidates = _coherent_candidates(fingers, contents, ringing)
-    else:
-        candidates = _switched_candidates(fingers, contents, ringing[0])
+    candidates = _SEARCHES[contents.drive_mode](fingers, contents, ringing)
     judgment = _judged(fingers, contents, candidates, ringing)
     best = np.zeros(1, dtype=int)
     is_apart = True
@@ -320,7 +314,9 @@ def _candidates_at(
 
 
 def _switched_candidates(
-    fingers: FingersOnPlate, contents: Contents, ringing: RingingUnderFingers | None
+    fingers: FingersOnPlate,
+    contents: Contents,
+    ringing: Sequence[RingingUnderFingers | None],
 ) -> _Candidates:
     """Find the best patterns of the drive mode `switched` for a single content.
 
@@ -328,17 +324,18 @@ def _switched_candidates(
     requested level.
     """
     (stream,) = contents.streams
+    (stream_ringing,) = ringing
     quiet = contents.quiet
     rows = contents.rows
-    if ringing is not None and quiet:
-        rows = ringing.lasting_long_enough(rows)
-    is_by_point = ringing is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
+    if stream_ringing is not None and quiet:
+        rows = stream_ringing.lasting_long_enough(rows)
+    is_by_point = stream_ringing is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
     all_rows = np.arange(len(fingers.table.frequencies))
     finger_forms = fingers.forms(all_rows, with_fine=is_by_point)
     steady = finger_forms.of(stream.targets, quiet, stream.level_db_sl, contents.background)
     if is_by_point:
         steady = finger_forms.by_point(steady, quiet, CENTER_AND_FOUR)
-    forms = _forms_at(rows, steady, ringing if quiet else None)
+    forms = _forms_at(rows, steady, stream_ringing if quiet else None)
     groups = _groups(fingers.table)
     candidates = list[_Candidate]()
     patterns_by_group = _switched_patterns([forms.among(group) for group in groups])
@@ -350,6 +347,10 @@ def _switched_candidates(
                 candidates.append(_Candidate(0, 0, score, drive))
     candidates.sort(key=attrgetter("score"), reverse=True)
     return _Candidates.of(candidates)
+
+
+_SEARCHES = {"switched": _switched_candidates, "phased": _coherent_candidates}
+"""Search for the candidates of a question, by drive mode."""
 
 
 def _switched_patterns(

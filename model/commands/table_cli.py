@@ -27,6 +27,7 @@ from model.commands.options import (
     progress_bar,
 )
 from model.config.units import parse_frequencies, parse_pair, parse_point
+from model.drive_modes import checked_mode, drive_modes_in_words
 from model.errors import InputError
 from model.files.output_paths import (
     begins_with,
@@ -64,8 +65,7 @@ def build(
         str,
         typer.Option(
             "--mode",
-            help="Default drive mode of queries: phased (any levels and phases), or switched (one "
-            "or two ERAs without phases, one vibration at a time).",
+            help=f"Default drive mode of queries: {drive_modes_in_words()}.",
         ),
     ] = "phased",
     grid: Annotated[
@@ -77,7 +77,6 @@ def build(
 ) -> None:
     """Solve the plate and write its table."""
     from model.compiled.kernels import why_slow
-    from model.drive_modes import checked_mode
     from model.finger import Grid
     from model.rig.rig_file import load_rig
     from model.table.table import default_drive_frequencies
@@ -175,7 +174,7 @@ def query(
     ] = False,
     drive_mode: Annotated[
         str | None,
-        typer.Option("--mode", help="Drive mode: phased or switched. Default: the table's."),
+        typer.Option("--mode", help="Drive mode, as for era table build. Default: the table's."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")

@@ -1,4 +1,4 @@
-/* Search for the weights of all ERAs at one frequency for the targets of one content. Reference: `model.drive_modes`. */
+/* Search for the weights of all ERAs at one frequency for the targets of one content. Reference: `model.phased_weights`. */
 #ifndef SEARCH_H
 #define SEARCH_H
 

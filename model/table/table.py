@@ -32,7 +32,6 @@ from model.arrays import (
     lattice,
 )
 from model.compiled.kernels import GivenRaster, kernels, run_kernel
-from model.drive_modes import highest_levels
 from model.ensemble.attached_plate import (
     AttachedPlate,
     PlateOnEras,
@@ -72,6 +71,7 @@ from model.structure.attachments import (
 from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
+from model.switched_patterns import highest_levels
 from model.transients.excursions import MagnetMotions, Swing, share_along
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes

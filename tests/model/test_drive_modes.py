@@ -8,10 +8,11 @@ import pytest
 from scipy.optimize import minimize
 
 from kit.plates import by_hand, contact_sets, forms_of, smooth_table
-from model import drive_modes
+from model import phased_weights, switched_patterns
 from model.answer.stimulus import Placement
 from model.arrays import NEARLY, Complex64Array
-from model.drive_modes import Forms, playable_drive_modes
+from model.drive_forms import Forms
+from model.drive_modes import playable_drive_modes
 from model.finger import fingertip_points
 from model.rig.rig import Uncertainty
 
@@ -79,13 +80,16 @@ MODES = ("switched", "phased")
 def found_in(mode, given):
     """The scores and drives that a mode finds, the best first; none where none reach the level."""
     if mode == "switched":
-        return drive_modes.find_switched(given)
-    found = drive_modes.search(given)
+        return switched_patterns.find_switched(given)
+    found = phased_weights.search(given)
     order = [at for at in np.argsort(-found.score).tolist() if found.score[at] > 0]
     return [(float(found.score[at]), [(at, found.weights[at])]) for at in order]
 
 
-HIGHEST = {"switched": drive_modes.max_sensation_switched, "phased": drive_modes.max_sensation}
+HIGHEST = {
+    "switched": switched_patterns.max_sensation_switched,
+    "phased": phased_weights.max_sensation,
+}
 """Of a mode, the highest amplitude to threshold."""
 
 
@@ -101,7 +105,7 @@ def found_alone(mode, given):
 )
 def test_find_switched_equals_brute_force(quiet, targets, wanted, batch, monkeypatch):
     """One or two ERAs of three at five frequencies: the best, each once, of all tried by hand."""
-    monkeypatch.setattr(drive_modes, "BATCH", batch)
+    monkeypatch.setattr(switched_patterns, "BATCH", batch)
     for seed in range(5):
         given = random_forms(seed, targets=targets, quiet=quiet, wanted=wanted)
         scores = []
@@ -113,8 +117,8 @@ def test_find_switched_equals_brute_force(quiet, targets, wanted, batch, monkeyp
                 ]
                 score, level = by_hand(given, drive)
                 scores += [score] if level >= wanted else []
-        best = sorted(scores, reverse=True)[: drive_modes.ALTERNATIVES]
-        found = drive_modes.find_switched(given)
+        best = sorted(scores, reverse=True)[: switched_patterns.ALTERNATIVES]
+        found = switched_patterns.find_switched(given)
         assert [score for score, _ in found] == pytest.approx(best, rel=1e-5)
         for score, drive in found:
             by, level = by_hand(given, drive)
@@ -211,7 +215,7 @@ def test_an_only_era_is_switched_at_its_best_frequency():
     threshold = np.array([1, 1, 0.6, 1], dtype=np.float32)
     power = (target * target)[..., None]
     given = Forms(target, power, quiet, threshold, wanted=1.5, level_margin=0.0)
-    found = drive_modes.find_switched(given)
+    found = switched_patterns.find_switched(given)
     assert [score for score, _ in found] == pytest.approx([4, 3, 2])
     assert [drive[0][0] for _, drive in found] == [1, 2, 0]
     assert [drive[0][1].tolist() for _, drive in found] == [[1]] * 3

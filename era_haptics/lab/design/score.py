@@ -1,10 +1,10 @@
 """Fast score of ERA layouts.
 
 The score is the expected contrast over sampled contact sets, computed like answers
-(`model.ensemble.expected_power`, `model.drive_modes`), at a few frequencies, from the receptances
-of the free plate. Each finger loads the plate at its own position; its effect on the other fingers
-is neglected, so everything is computed once per finger. With ERAs e of dynamic stiffness Z on the
-plate, a finger f of dynamic stiffness D and its points p:
+(`model.ensemble.expected_power`, `model.phased_weights`), at a few frequencies, from the
+receptances of the free plate. Each finger loads the plate at its own position; its effect on the
+other fingers is neglected, so everything is computed once per finger. With ERAs e of dynamic
+stiffness Z on the plate, a finger f of dynamic stiffness D and its points p:
 
     K = (1 + Z A_ee)^-1,  G = A_pe K,  L = A_pf - G Z A_ef,  M = D / (1 + D L_f)
     t_e = G_p - L_p M G_f,  h = -w² t_e z stroke,  r_e = stroke - u_e,  r_f = -u_f

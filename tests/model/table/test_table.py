@@ -12,7 +12,6 @@ from kit.plates import contact_sets, make_paper_rig, smooth_rig, smooth_table
 from kit.set_table import only
 from model.answer.plan import query
 from model.answer.stimulus import Placement
-from model.drive_modes import highest_levels
 from model.errors import InputError
 from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
@@ -21,6 +20,7 @@ from model.structure.attachments import FingertipLoad
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.study.exact_plates import Plates, felt_on
+from model.switched_patterns import highest_levels
 from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
 from model.table.table_file import TableProblem, build_table
 from model.vibration import Tone, tone_fields

@@ -24,7 +24,7 @@ from model.answer.answer import Answer
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, Point
-from model.drive_modes import Forms, WeightedTones
+from model.drive_forms import Forms, WeightedTones
 from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid, detection_threshold

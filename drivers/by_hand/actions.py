@@ -23,8 +23,8 @@ from drivers.by_hand.reaching import identified, keep_alive, random_session, rea
 from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_rows, wire_rows
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
-from drivers.host.ledger import StagedSet
 from drivers.host.requests import Priority
+from drivers.host.set_admission import StagedSet
 from drivers.host.stops import StopOutcome
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (

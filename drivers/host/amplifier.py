@@ -7,8 +7,7 @@ and replies show is noted by `AmplifierRecord`.
 import asyncio
 import contextlib
 import math
-from collections.abc import Coroutine, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,9 +15,8 @@ from drivers.errors import CommandError, CommandRefused, FrameError, LinkTimeout
 from drivers.host.amplifier_record import AmplifierRecord, disarmed
 from drivers.host.contradictions import MAX_CONTRADICTIONS, contradicted
 from drivers.host.identification import driven_by_another
-from drivers.host.ledger import StagedSet
 from drivers.host.requests import Priority
-from drivers.host.set_admission import IsPreempted, SetRequest
+from drivers.host.set_admission import IsPreempted, StagedSet
 from drivers.host.stops import CONFIRM_INTERVAL, PendingStop, StopOutcome
 from drivers.playing import AmplifierLayer
 from drivers.protocol.achieved import achieved_layer, achieved_problem
@@ -68,25 +66,33 @@ class Amplifier(AmplifierRecord):
         CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
         a row have another token.
         """
-        request = SetRequest(token, layers, now, is_preempted)
+        staged = self.admission.set_of(layers)
+        staged.token = token
+        staged.is_immediate = now
+        make = partial(self._make_set, staged, is_preempted)
         for _ in range(MAX_CONTRADICTIONS):
-            reply = await self.line.submit(self, priority, "Set", partial(self._make_set, request))
+            reply = await self.line.submit(self, priority, "Set", make)
             if reply["token"] == token:
                 break
         else:
             problem = f"a set with token {token} must be taken, got token {reply['token']}"
             # This is not a rejection: the group stops all amplifiers.
             raise FrameError(str(contradicted(self.name, problem)))
-        staged = request.staged
         is_staged = reply["staged"] and not now and self.admission.admitted is staged
-        if staged is None or not (reply["played"] or is_staged):
+        if not (reply["played"] or is_staged):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
-        return staged if reply["exact"] else replace(staged, is_exact=False)
+        staged.is_exact = bool(reply["exact"])
+        return staged
 
-    def _make_set(self, request: SetRequest) -> list[Values]:
+    def _make_set(self, staged: StagedSet, is_preempted: IsPreempted | None) -> list[Values]:
         """Admit a set, and return the values of its parts; raises CommandRefused or Overtaken."""
         return self.admission.admit(
-            request, self.ledger, self._time(), session=self.session, set_time=self._sets_time()
+            staged,
+            self.ledger,
+            self._time(),
+            session=self.session,
+            set_time=self._sets_time(),
+            is_preempted=is_preempted,
         )
 
     def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
@@ -99,15 +105,13 @@ class Amplifier(AmplifierRecord):
         """Return how long sets to all amplifiers of the line take [s]."""
         return len(self.line.members) * self.exchange_time("Set")
 
-    def commit(self, token: int, at: int, starts_at: float | None) -> asyncio.Future[Values]:
-        """Play the staged set; returns a future of the status, which shows the tokens.
+    def commit(self, staged: StagedSet, at: int) -> asyncio.Future[Values]:
+        """Play a staged set; returns a future of the status, which shows the tokens.
 
-        at: high word of the amplifier's clock at which it starts; starts_at: that moment [s], None
-        for an immediate start. The future raises Preempted if a stop or disarm came first,
-        CommandRefused if it is too late for the ledger's admission.
+        at: high word of the amplifier's clock at which it starts. The future raises Preempted if a
+        stop or disarm came first, CommandRefused if it is too late for the ledger's admission.
         """
-        self.expect_commit(starts_at)
-        values = {"session": self.session, "token": token, "at": at}
+        values = {"session": self.session, "token": staged.token, "at": at}
         return self.line.submit(self, Priority.SET, "Commit", values)
 
     def wire_ramp(self, ramp: float) -> int:
@@ -161,10 +165,21 @@ class Amplifier(AmplifierRecord):
         Identifies the amplifier again, because it may have lost power and returned with other
         limits. A stop or disarm that comes after this call goes first, even before it is awaited.
         """
-        self.expect_arm(threads.now() + _ARM_WITHIN)
-        return self._arm(session, watchdog)
+        check = partial(self._check_may_arm, self.disarms_sent, threads.now() + _ARM_WITHIN)
+        return self._arm(session, watchdog, check)
 
-    async def _arm(self, session: int, watchdog: float) -> Values:
+    def _check_may_arm(self, disarms_sent: int, until: float) -> None:
+        """Raise Preempted or LinkTimeout if an Arm must not be sent any more.
+
+        disarms_sent: when the Arm was requested; until: when it expires [s].
+        """
+        if self.disarms_sent != disarms_sent:
+            raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+        if self._time() > until:  # this machine slept, and the caller does not expect it now
+            raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
+
+    async def _arm(self, session: int, watchdog: float, check: Callable[[], None]) -> Values:
+        """Arm the amplifier; check: called before Arm is sent, see `Line.submit`."""
         # The timeout is short so that the watchdogs of other armed amplifiers do not run down.
         await self.identify(timeout=REPLY_TIMEOUT)
         wire = _WATCHDOG.to_wire(watchdog)
@@ -181,7 +196,7 @@ class Amplifier(AmplifierRecord):
 
         was_armed = self.may_be_armed
         try:
-            status = await self.line.submit(self, Priority.ARM, "Arm", make)
+            status = await self.line.submit(self, Priority.ARM, "Arm", make, check=check)
         except CommandRefused as error:
             if not (isinstance(error, Preempted) or error.may_play):
                 self.may_be_armed = was_armed

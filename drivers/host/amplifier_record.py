@@ -13,14 +13,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
-from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkTimeout, Preempted
+from drivers.errors import CommandError, CommandRefused, LinkDegraded
 from drivers.host.clock import HeldClock
 from drivers.host.contradictions import MAX_START_ERROR, StatusContradictions
 from drivers.host.identification import AmplifierIdentification
-from drivers.host.ledger import Ledger, StagedSet
+from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.requests import LinkStatistics, Priority
-from drivers.host.set_admission import SetAdmission
+from drivers.host.set_admission import SetAdmission, StagedSet
 from drivers.host.status_reports import REPORT_LIFE, REPORTS, ReportKind, reports_of
 from drivers.host.stops import PendingStop, PlaybackBound, StopOutcome
 from drivers.host.watchdog import Feeding
@@ -94,10 +94,6 @@ class AmplifierRecord:
     """Session of the last Arm."""
     may_be_armed: bool = False
     """Whether it may have carried out an Arm of this host since it was last disarmed."""
-    _disarms_before_arm: int = 0
-    """`disarms_sent` when Arm was requested: a later stop or disarm prevents it."""
-    _arms_until: float = -math.inf
-    """Until when the requested Arm may go out [s]."""
     feeding: Feeding
     """When its watchdog was fed."""
     clock: HeldClock
@@ -106,8 +102,6 @@ class AmplifierRecord:
     # Sets
     played_at: float = -math.inf
     """Earliest start [s] of the last set sent, or the time when silence was sent."""
-    _starts_at: float | None = None
-    """Start [s] of the staged set by the next commit; None or a time in the past: immediately."""
     committed: int = 0
     """Token of the set that it committed last; 0 if it committed none since it was armed."""
     _ledger: Ledger | None = None
@@ -201,15 +195,6 @@ class AmplifierRecord:
             duration = self.line.wire.exchange_time(words, reply_words("Set"))
         return duration
 
-    def expect_commit(self, starts_at: float | None) -> None:
-        """Expect a commit that starts the staged set at a time [s]; None: immediately."""
-        self._starts_at = starts_at
-
-    def expect_arm(self, until: float) -> None:
-        """Expect an Arm until a time [s], unless a stop or disarm comes first."""
-        self._disarms_before_arm = self.disarms_sent
-        self._arms_until = until
-
     def check_may_send(self, name: str, values: Values, priority: Priority) -> None:
         """Raise if a request would play or feed and must not be sent.
 
@@ -226,8 +211,6 @@ class AmplifierRecord:
             # A set that only silences, or changes nothing, is never too late.
             may_be_late = priority is not Priority.SET
             self.admission.check(values["token"], now, may_be_late=may_be_late)
-        if message.arms:
-            self._check_may_arm(now)
         self.identification.check_other_host(now)
         if self.no_reply_cause is not None:
             raise LinkDegraded(
@@ -236,13 +219,6 @@ class AmplifierRecord:
             )
         if not message.arms and self.status is not None and self.status["state"] != ENABLED:
             raise disarmed(self.name, self.status)
-
-    def _check_may_arm(self, now: float) -> None:
-        """Raise Preempted or LinkTimeout if a requested Arm must not be sent any more."""
-        if self.disarms_sent != self._disarms_before_arm:
-            raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-        if now > self._arms_until:  # this machine slept, and the caller does not expect it now
-            raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
 
     def note_identified(self, identity: Values, capabilities: Values) -> None:
         """Note the records of the expected amplifier; it may have lost power before."""
@@ -308,14 +284,14 @@ class AmplifierRecord:
             return
         if message is _COMMIT:
             self._note_commit(admitted, now, arrives)
-        elif values["now"] and is_last(values):
+        elif admitted.is_immediate and is_last(values):
             self._note_immediate_start(admitted, now, arrives)
 
     def _note_commit(self, admitted: StagedSet, now: float, arrives: float) -> None:
-        """Note the commit of a set, which starts at `_starts_at`, or when the commit arrives."""
+        """Note the commit of a set, which starts at its time, or when the commit arrives."""
         error = abs(self.clock.lead(now)) + _SURELY * self.clock.scatter(now)
         self.contradictions.note_commit(now, error)
-        starts_at = self._starts_at
+        starts_at = admitted.starts_at
         if starts_at is None or starts_at <= now:
             self.played_at = arrives
             self.ledger.sent(admitted.token, admitted.layers, now)

@@ -74,8 +74,8 @@ class Group:
         """A second arm waits for the first."""
         self._closing = asyncio.Lock()
         """A second close waits for the first."""
-        self._limit: asyncio.Timeout | None = None
-        """Ends an exchange in progress if it is rescheduled to an earlier time."""
+        self._limits = set[asyncio.Timeout]()
+        """Each ends an exchange in progress if it is rescheduled to an earlier time."""
 
     @property
     def clock_errors(self) -> Mapping[str, float]:
@@ -236,12 +236,13 @@ class Group:
         return self.members.last_sent_at
 
     def abort_exchange(self) -> None:
-        """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
+        """End each `apply`, `silence` or `beat` in progress, so that silence can be sent next.
 
         Requests that were not sent yet are dropped; one on the wire is awaited for at most 8 ms.
         """
-        if self._limit is not None and not self._limit.expired():
-            self._limit.reschedule(threads.now())
+        for limit in self._limits:
+            if not limit.expired():
+                limit.reschedule(threads.now())
 
     async def _exchange(self, exchange: Callable[[], Awaitable[_T]]) -> _T:
         """Run an exchange of the control loop; react to an error, then raise it."""
@@ -251,10 +252,11 @@ class Group:
         limit = asyncio.timeout(None)
         try:
             try:
-                async with limit as self._limit:
+                async with limit:
+                    self._limits.add(limit)
                     return await exchange()
             finally:
-                self._limit = None
+                self._limits.discard(limit)
         except Exception as error:
             failure = self._failure_of(error, epoch, is_aborted=limit.expired())
             reported_error = await self._react(failure, error)

@@ -23,11 +23,11 @@ from drivers.errors import CommandRefused, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.amplifier_record import COMMITTING
 from drivers.host.group_states import Failure
-from drivers.host.ledger import StagedSet, is_silence
+from drivers.host.ledger import is_silence
 from drivers.host.line import Line
 from drivers.host.members import Members, last_fed_at, outcomes
 from drivers.host.requests import Priority
-from drivers.host.set_admission import IsPreempted
+from drivers.host.set_admission import IsPreempted, StagedSet
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     AHEAD_MAX,
@@ -272,6 +272,8 @@ class JointSets:
             deadline = min([staged_set.until for staged_set in staged_sets.values()])
             await _wait_until_free([*by_line], until=deadline)
             moment = moment_behind(max([line.commit_arrives() for line in by_line]))
+        for staged_set in staged_sets.values():
+            staged_set.starts_at = moment
         words = _start_words(moment, [*staged_sets])
         requests: dict[Amplifier, Awaitable[Values]] = {}
         broadcasts: list[Awaitable[Values]] = []
@@ -279,9 +281,9 @@ class JointSets:
             line_words = {words[amplifier] for amplifier in line_amplifiers}
             if len(line_amplifiers) == 1 or len(line_words) > 1:  # a clock is not steered
                 for amplifier in line_amplifiers:
-                    requests[amplifier] = amplifier.commit(token, words[amplifier], moment)
+                    requests[amplifier] = amplifier.commit(staged_sets[amplifier], words[amplifier])
                 continue
-            make = partial(_joint_commit, line_amplifiers, token, line_words.pop(), moment)
+            make = partial(commit_of, line_amplifiers, token, line_words.pop())
             broadcasts.append(line.submit(None, Priority.SET, "Commit", make))
             for amplifier in line_amplifiers:
                 # A heartbeat confirms the broadcast, and feeds the watchdog meanwhile.
@@ -290,7 +292,7 @@ class JointSets:
         statuses = await self._members.all([*requests.values(), *broadcasts])
         for amplifier, status in zip(requests, statuses, strict=False):
             if status["token"] != token or status["state"] in LATCHED:
-                await _check_plays(amplifier, status, token)
+                await _check_plays(amplifier, status, staged_sets[amplifier])
 
     async def _close_gaps(self) -> None:
         """Let amplifiers whose token is far behind commit an empty set, which changes nothing."""
@@ -398,19 +400,6 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
     )
 
 
-def _joint_commit(
-    amplifiers: Sequence[Amplifier], token: int, at: int, starts_at: float | None
-) -> list[Values]:
-    """Return a commit of the staged sets of several amplifiers of a line; see `commit_of`.
-
-    starts_at: when the sets start [s]; None: immediately.
-    """
-    messages = commit_of(amplifiers, token, at)
-    for amplifier in amplifiers:
-        amplifier.expect_commit(starts_at)
-    return messages
-
-
 def commit_of(amplifiers: Sequence[Amplifier], token: int, at: int) -> list[Values]:
     """Return a commit for several amplifiers of a line; raises unless it is allowed for all."""
     values = {"session": amplifiers[0].session, "token": token, "at": at}
@@ -419,15 +408,18 @@ def commit_of(amplifiers: Sequence[Amplifier], token: int, at: int) -> list[Valu
     return [values]
 
 
-async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None:
-    """Raise CommandRefused unless an amplifier plays the set with this token.
+async def _check_plays(amplifier: Amplifier, status: Values, staged: StagedSet) -> None:
+    """Raise CommandRefused unless an amplifier plays a set.
 
     status: of a heartbeat, which may have been sent before the commit. If no status has shown the
-    token, the commit is repeated once. The ledger compares what its layers play with each status.
+    token of the set, the commit is repeated once. The ledger compares what its layers play with
+    each status.
     """
+    token = staged.token
     if amplifier.committed != token and status["state"] not in LATCHED:
         word = word_passed_by_all(threads.now(), [amplifier])
-        status = await amplifier.commit(token, word, None)
+        staged.starts_at = None
+        status = await amplifier.commit(staged, word)
     if amplifier.committed != token or status["state"] in LATCHED:
         raise CommandRefused(
             f"amplifier {amplifier.name}: token must be {token} while armed, got "

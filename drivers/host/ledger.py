@@ -10,7 +10,7 @@ import logging
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 from drivers.errors import CommandRefused
@@ -39,19 +39,6 @@ _STEPS = 2  # tolerance of levels in a status, in steps
 _MEASURING_ERROR = 0.002  # of full level, if the amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, as a share of a weak level
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class StagedSet:
-    """A set that an amplifier has staged, or plays immediately."""
-
-    token: int
-    layers: tuple[LayerSet, ...]
-    """Its layers in integers of the wire."""
-    is_exact: bool
-    """Whether the amplifier plays exactly these integers, without further rounding."""
-    until: float
-    """Deadline of its commit [s]."""
 
 
 class Doubt(NamedTuple):

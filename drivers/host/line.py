@@ -120,14 +120,16 @@ class Line:
         values: Values | Make,
         *,
         timeout: float = REPLY_TIMEOUT,
+        check: Callable[[], None] | None = None,
     ) -> "asyncio.Future[Values]":
         """Queue a request to an amplifier; returns a future of the values of its reply.
 
         The future raises LinkError, LinkTimeout, FrameError, CommandRefused, or Preempted if a
         request with a higher priority made this one obsolete. member: None for a broadcast, which
-        has no reply; its future ends once it was sent.
+        has no reply; its future ends once it was sent. check: called before each message is sent;
+        raises an error if the request must not be sent any more.
         """
-        job = Job(member, priority, name, timeout, self.time())
+        job = Job(member, priority, name, timeout, self.time(), check=check)
         if callable(values):
             job.make = values
         else:
@@ -323,6 +325,8 @@ class Line:
         if job.attempts == ATTEMPTS:
             self.wire.counters.remark = ""
         job.make_parts()
+        if job.check is not None:
+            job.check()
         member = job.member
         takes = 0.0
         address = BROADCAST

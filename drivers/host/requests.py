@@ -140,6 +140,8 @@ class Job:
     """The values of its messages; only the last message has a reply."""
     make: Make | None = None
     """Makes the messages; None once it has been called."""
+    check: Callable[[], None] | None = None
+    """Called before each message is sent; raises an error if it must not be sent any more."""
     result: "asyncio.Future[Values]" = field(default_factory=asyncio.Future)
     part: int = 0
     """Index of the message that is on the line, or is sent next."""

@@ -1,5 +1,6 @@
-"""Admission of sets to one amplifier: a set is sent only while its check by the ledger is valid."""
+"""Sets on their way to one amplifier: each is sent only while its check by the ledger is valid."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -7,7 +8,7 @@ from typing import TypeAlias
 from drivers.errors import CommandRefused, Overtaken, Preempted
 from drivers.host.bounds import COMMIT_DELAY
 from drivers.host.identification import AmplifierIdentification
-from drivers.host.ledger import Ledger, StagedSet
+from drivers.host.ledger import Ledger
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ATTEMPTS, LAYER
 from drivers.protocol.records import Values
@@ -26,33 +27,30 @@ IsPreempted: TypeAlias = Callable[[], bool]
 """Whether something more urgent waits, so that a set that does not play yet is dropped."""
 
 
-@dataclass(frozen=True, slots=True)
-class _CheckedSet:
-    """Layers that the ledger admits, ready to be staged."""
+@dataclass(eq=False, slots=True)
+class StagedSet:
+    """A set on its way to an amplifier: requested, checked, staged, and committed."""
 
-    layers: Sequence[AmplifierLayer]
-    """The layers as requested."""
-    admitted: tuple[LayerSet, ...]
-    """The layers as admitted."""
-    stream: list[int]
+    requested: Sequence[AmplifierLayer]
+    """Its layers as requested."""
+    layers: tuple[LayerSet, ...] = ()
+    """Its layers as the ledger admits them, in integers of the wire."""
+    stream: Sequence[int] = ()
     """The admitted layers as words of the wire."""
-    delay: float
-    """Longest time from staging until they are committed [s]."""
-    valid_until: float
-    """Until when the check is valid [s], if nothing is sent or received meanwhile."""
-
-
-@dataclass
-class SetRequest:
-    """A set that is checked when its turn on the line comes."""
-
-    token: int
-    layers: Sequence[AmplifierLayer]
-    now: bool
-    """Whether it plays immediately."""
-    is_preempted: IsPreempted | None
-    staged: StagedSet | None = None
-    """The set as it was made last."""
+    delay: float = 0.0
+    """Longest time from staging until it is committed [s]."""
+    checked_until: float = -math.inf
+    """Until when its check is valid [s]."""
+    token: int = 0
+    """0 until it is staged."""
+    is_immediate: bool = False
+    """Whether it plays as soon as it is complete, without a commit."""
+    until: float = -math.inf
+    """Deadline of its commit [s]."""
+    is_exact: bool = True
+    """Whether the amplifier plays exactly its layers, without further rounding."""
+    starts_at: float | None = None
+    """When its commit starts it [s]; None or a time in the past: immediately."""
 
 
 class SetAdmission:
@@ -63,71 +61,85 @@ class SetAdmission:
 
     admitted: StagedSet | None = None
     """The set that is staged and not committed yet; None after a stop, disarm or silence."""
-    _checked: _CheckedSet | None = None
-    """The layers that were checked last, if this check can be used again."""
+    _checked: StagedSet | None = None
+    """The set that was checked last, unless anything was sent or received since."""
 
     def __init__(self, name: str, identification: AmplifierIdentification) -> None:
         self._name = name
         self._identification = identification
 
+    def set_of(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
+        """Return the set of these layers that was checked last, or else a new one."""
+        checked = self._checked
+        if checked is not None and checked.requested is layers and not checked.token:
+            return checked
+        return StagedSet(layers)
+
     def admit(
-        self, request: SetRequest, ledger: Ledger, now: float, *, session: int, set_time: float
+        self,
+        staged: StagedSet,
+        ledger: Ledger,
+        now: float,
+        *,
+        session: int,
+        set_time: float,
+        is_preempted: IsPreempted | None,
     ) -> list[Values]:
-        """Admit a set now, and return the values of its parts.
+        """Admit a set with a token now, and return the values of its parts.
 
         set_time: how long sets to all amplifiers of the line take [s]. Raises CommandRefused, or
         Overtaken if the set is preempted.
         """
-        token = request.token
-        if request.is_preempted is not None and request.is_preempted():
-            raise Overtaken(f"amplifier {self._name}: set {token} is preempted")
-        checked = self._checked
-        if checked is None or checked.layers is not request.layers or now > checked.valid_until:
-            checked = self._check(request.layers, ledger, now, set_time=set_time)
-        self._checked = None
-        messages = parts(checked.stream, session=session, token=token, now=request.now)
-        request.staged = StagedSet(token, checked.admitted, True, until=now + checked.delay)
-        self.admitted = request.staged
-        return messages
+        if is_preempted is not None and is_preempted():
+            raise Overtaken(f"amplifier {self._name}: set {staged.token} is preempted")
+        if now > staged.checked_until:
+            self._check(staged, ledger, now, set_time=set_time)
+        staged.until = now + staged.delay
+        self.admitted = staged
+        return parts(staged.stream, session=session, token=staged.token, now=staged.is_immediate)
 
     def refusal_of(
         self, layers: Sequence[AmplifierLayer], ledger: Ledger, now: float, *, set_time: float
     ) -> CommandRefused | None:
         """Return why the ledger would not admit layers now; None if it would.
 
-        The result is used again if the layers are admitted within 5 ms and nothing is sent or
-        received meanwhile. set_time: see `admit`.
+        The check counts if the layers are staged within 5 ms and nothing is sent or received
+        meanwhile. set_time: see `admit`.
         """
+        checked = StagedSet(layers)
         try:
-            self._checked = self._check(
-                layers, ledger, now, set_time=set_time, valid_for=_CHECKED_FOR
-            )
+            self._check(checked, ledger, now, set_time=set_time, valid_for=_CHECKED_FOR)
         except CommandRefused as error:
             return error
+        self.expire_check()
+        self._checked = checked
         return None
 
     def _check(
         self,
-        layers: Sequence[AmplifierLayer],
+        staged: StagedSet,
         ledger: Ledger,
         now: float,
         *,
         set_time: float,
         valid_for: float = 0.0,
-    ) -> _CheckedSet:
-        """Check layers for staging within a time from now [s]; raises CommandRefused."""
+    ) -> None:
+        """Check a set for staging within a time from now [s]; raises CommandRefused."""
         delay = max(COMMIT_DELAY, ATTEMPTS * set_time)
-        words = _word_count(layers)
+        words = _word_count(staged.requested)
         if words > PART_WORDS:  # parts for all amplifiers of the line, each perhaps repeated
             delay += 2 * words / PART_WORDS * set_time
-        admitted = ledger.admit(layers, now, delay=delay + valid_for)
-        stream = pack_layers(admitted)
-        if not self._identification.is_complete and is_vibrating(*admitted):
+        staged.layers = ledger.admit(staged.requested, now, delay=delay + valid_for)
+        staged.stream = pack_layers(staged.layers)
+        if not self._identification.is_complete and is_vibrating(*staged.layers):
             raise CommandRefused(f"amplifier {self._name} must be identified first; open it again")
         max_words = min(ledger.capabilities["set_words"], MAX_PARTS * PART_WORDS)
-        if len(stream) > max_words:
-            raise CommandRefused(f"a set must have at most {max_words} words, got {len(stream)}")
-        return _CheckedSet(layers, admitted, stream, delay, now + valid_for)
+        if len(staged.stream) > max_words:
+            raise CommandRefused(
+                f"a set must have at most {max_words} words, got {len(staged.stream)}"
+            )
+        staged.delay = delay
+        staged.checked_until = now + valid_for
 
     def check(self, token: int, now: float, *, may_be_late: bool) -> None:
         """Raise Preempted or CommandRefused unless the set with a token may be sent now.
@@ -145,8 +157,10 @@ class SetAdmission:
             )
 
     def expire_check(self) -> None:
-        """Let the last check not be used again, because something was sent or received."""
-        self._checked = None
+        """End the validity of the last check, because something was sent or received."""
+        if self._checked is not None:
+            self._checked.checked_until = -math.inf
+            self._checked = None
 
     def withdraw(self) -> None:
         """Let the staged set not be committed, because the amplifier is silenced or armed."""

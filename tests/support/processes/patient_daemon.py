@@ -38,9 +38,11 @@ def wait_long(patch: pytest.MonkeyPatch, reply_timeout: float = REPLY_TIMEOUT) -
         patch.setitem(made.__init__.__kwdefaults__, "watchdog", LONG_WATCHDOG)  # type: ignore[arg-type]
     arm = Amplifier._arm
 
-    async def arm_for_long(amplifier: Amplifier, session: int, watchdog: float) -> Any:
+    async def arm_for_long(
+        amplifier: Amplifier, session: int, watchdog: float, *options: Any
+    ) -> Any:
         longest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_max"])
-        return await arm(amplifier, session, min(watchdog, longest))
+        return await arm(amplifier, session, min(watchdog, longest), *options)
 
     patch.setattr(Amplifier, "_arm", arm_for_long)
 

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchema
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from drivers.host.status_reports import ReportKind
+from drivers.host.statuses import ReportKind
 
 API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""

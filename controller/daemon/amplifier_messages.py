@@ -15,7 +15,7 @@ from controller.operation.operation_states import Loss
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost
 from drivers.host.requests import LinkStatistics
-from drivers.host.status_reports import REPORT_LIFE, REPORTS, ReportKind
+from drivers.host.statuses import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.stops import StopOutcome
 from drivers.protocol.definition import FAULTS, QUANTITIES, READINGS, STATES, has_flag, name_of
 from drivers.protocol.records import Values

@@ -22,7 +22,7 @@ from controller.api.schema import (
     DaemonStateName,
     LatencySummary,
 )
-from drivers.host.status_reports import ReportKind
+from drivers.host.statuses import ReportKind
 from drivers.protocol.definition import READINGS
 
 _LINK_COUNTERS = {

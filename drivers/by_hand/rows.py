@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.host.amplifier import Amplifier
-from drivers.host.status_reports import REPORTS, reports_of
+from drivers.host.statuses import REPORTS, reports_of
 from drivers.protocol.definition import (
     CLOCK_UNKNOWN,
     FAULTS,

@@ -13,10 +13,10 @@ from typing import Any
 
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkTimeout, Preempted
 from drivers.host.amplifier_record import AmplifierRecord, disarmed
-from drivers.host.contradictions import MAX_CONTRADICTIONS, contradicted
 from drivers.host.identification import driven_by_another
 from drivers.host.requests import Priority
 from drivers.host.set_admission import IsPreempted, StagedSet
+from drivers.host.statuses import MAX_CONTRADICTIONS, contradicted
 from drivers.host.stops import CONFIRM_INTERVAL, PendingStop, StopOutcome
 from drivers.playing import AmplifierLayer
 from drivers.protocol.achieved import achieved_layer, achieved_problem

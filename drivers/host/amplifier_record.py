@@ -15,13 +15,19 @@ from functools import cache
 
 from drivers.errors import CommandError, CommandRefused, LinkDegraded
 from drivers.host.clock import HeldClock
-from drivers.host.contradictions import MAX_START_ERROR, StatusContradictions
 from drivers.host.identification import AmplifierIdentification
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.requests import LinkStatistics, Priority
 from drivers.host.set_admission import SetAdmission, StagedSet
-from drivers.host.status_reports import REPORT_LIFE, REPORTS, ReportKind, reports_of
+from drivers.host.statuses import (
+    MAX_START_ERROR,
+    REPORT_LIFE,
+    REPORTS,
+    ReportKind,
+    StatusContradictions,
+    reports_of,
+)
 from drivers.host.stops import PendingStop, PlaybackBound, StopOutcome
 from drivers.host.watchdog import Feeding
 from drivers.protocol.definition import (

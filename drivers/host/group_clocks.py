@@ -20,8 +20,7 @@ from drivers.host.clock import HeldClock
 from drivers.host.joint_sets import JointSets
 from drivers.host.line import Line
 from drivers.host.members import Members
-from drivers.host.reply_timing import GRACE
-from drivers.host.requests import Priority
+from drivers.host.requests import GRACE, Priority
 from drivers.protocol.definition import HEARTBEAT, has_feature
 
 # Errors of a clock [s]: a good clock does not lower a promise, a fair one by a tenth of a dB.

@@ -18,8 +18,7 @@ from drivers.host.group_clocks import Clocks
 from drivers.host.joint_sets import JointSets, commit_of, word_passed_by_all
 from drivers.host.line import Line
 from drivers.host.members import Members, is_lost
-from drivers.host.reply_timing import GRACE
-from drivers.host.requests import Make, Priority
+from drivers.host.requests import GRACE, Make, Priority
 from drivers.protocol.definition import HEARTBEAT, REQUESTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token

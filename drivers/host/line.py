@@ -5,10 +5,10 @@
 when its turn comes, so that they are checked once, against the requests really sent before.
 
 An `Attempt` is the transmission of one message and the wait for its reply. It ends with a reply, at
-its deadline, or earlier if a more urgent request waits (`drivers.host.reply_timing`). A request
-without a reply is repeated. The parts of a set are sent without a pause; only the last part has a
-reply, and only missing parts are repeated. On Modbus a message is a write and a read, and each part
-of a set is confirmed. Times [s] refer to the event loop's clock.
+its deadline, or earlier if a more urgent request waits. A request without a reply is repeated. The
+parts of a set are sent without a pause; only the last part has a reply, and only missing parts are
+repeated. On Modbus a message is a write and a read, and each part of a set is confirmed. Times [s]
+refer to the event loop's clock.
 """
 
 import asyncio
@@ -24,8 +24,16 @@ from drivers.errors import (
     no_reply,
     refused_by_amplifier,
 )
-from drivers.host.reply_timing import Attempt, AttemptPhase, ReplyTiming
-from drivers.host.requests import Job, JobQueue, Make, Member, Priority
+from drivers.host.requests import (
+    Attempt,
+    AttemptPhase,
+    Job,
+    JobQueue,
+    Make,
+    Member,
+    Priority,
+    ReplyTiming,
+)
 from drivers.ports import OpenPort
 from drivers.protocol.definition import (
     ATTEMPTS,

@@ -20,7 +20,8 @@ from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
-from model.structure.attachments import attached_stiffness, fingertip_loads
+from model.structure.attachments import attached_stiffness
+from model.structure.fingertips import fingertip_loads
 from model.study.exact_plates import Plates
 from model.vibration import Excitation, base_amplitudes
 

@@ -34,7 +34,7 @@ from model.rig.rig_warnings import (
     resonance_notes,
 )
 from model.rig.sections import LimitsSection
-from model.structure.attachments import support_problem
+from model.structure.statics import support_problem
 from model.structure.surface import center_of_surface
 from model.study.promise_cost import clock_cost, uncertainty_cost
 from model.transients.excursions import excursion_notes

@@ -50,7 +50,7 @@ from model.rig.rig_file import load_rig as load_rig
 from model.rig.rig_writing import change_rig as change_rig
 from model.rig.rig_writing import rig as rig
 from model.rig.rig_writing import save_rig as save_rig
-from model.structure.attachments import Fingertip as Fingertip
+from model.structure.fingertips import Fingertip as Fingertip
 from model.study.contrast_maps import ContrastMap as ContrastMap
 from model.table.table import LocalizationTable as LocalizationTable
 from model.table.table_file import load_table as load_table

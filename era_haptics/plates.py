@@ -33,7 +33,8 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
 from model.reduction.supported_plate import SupportedModes, supported_modes
 from model.rig.rig import Rig
-from model.structure.attachments import check_loads, footprints_of
+from model.structure.attachments import footprints_of
+from model.structure.fingertips import check_loads
 from model.study.contrast_maps import ContrastMap
 from model.table.table import LocalizationTable, default_drive_frequencies
 from model.vibration import PlateMap, Tone, plate_map

@@ -25,12 +25,8 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.structure.attachments import (
-    PointLoad,
-    check_footprints_on_plate,
-    footprints_of,
-    mean_over,
-)
+from model.structure.attachments import PointLoad, footprints_of
+from model.structure.footprints import check_footprints_on_plate, mean_over
 from model.structure.modal_elasticity import Discretization
 from model.structure.plate import SHEAR_CORRECTION, Plate
 

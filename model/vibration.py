@@ -32,11 +32,12 @@ from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_plate import on_springs
 from model.rig.rig import Rig
 from model.rig.rig_mesh import mesh_of
-from model.spectral.modes import PlateMesh, SpectralMesh
-from model.structure.attachments import PointLoad, Source, footprints_of
+from model.spectral.plate_mesh import PlateMesh, SpectralMesh
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.exciter import Actuator
 from model.structure.modal_elasticity import check_is_plate
 from model.structure.plate import Plate
+from model.structure.sources import Source
 
 
 @dataclass(frozen=True)

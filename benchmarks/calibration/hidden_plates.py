@@ -29,7 +29,8 @@ from model.estimate.sensed_plate import sensed_plate
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.structure.attachments import Era, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.sources import Era
 
 MESH = (6, 5)  # within 0.1 % of converged, with strips
 STRIP = 3e-3  # m, twice the plate's thickness

@@ -26,7 +26,7 @@ from model.reduction import free_plate
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_mesh import mesh_of
 from model.spectral import polynomials
-from model.structure.attachments import Era
+from model.structure.sources import Era
 
 NAME = "era-haptics"
 

@@ -24,7 +24,7 @@ from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray
 from model.finger import FINGERTIP_RADIUS, decibels
-from model.structure.attachments import Fingertip, FingertipLoad, object_load
+from model.structure.fingertips import Fingertip, FingertipLoad, object_load
 from model.study.exact_plates import Plates, accelerations_on, draw_plates
 from model.table.table import LocalizationTable, read_fingertips
 from model.vibration import Excitation, base_amplitudes

@@ -38,7 +38,7 @@ from model.rig.key_types import Identifier
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of, with_base
 from model.rig.rig_warnings import gain_notes
-from model.structure.attachments import check_supported
+from model.structure.statics import check_supported
 from registry.limits import MAX_CONTACTS, MAX_FINGERS
 
 MAX_LAYOUTS = 64

@@ -56,7 +56,7 @@ from model.answer.promise import with_tones
 from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Placement, Stimulus
 from model.arrays import Complex64Array, FloatArray, Point
 from model.finger import FINGERTIP_RADIUS
-from model.structure.attachments import MIN_LOAD
+from model.structure.fingertips import MIN_LOAD
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, Tone

@@ -19,7 +19,7 @@ from model.answer.answer import HELD_BACK, MIXED, OWN, SHARED, Layer, Sensation,
 from model.answer.envelope import Course
 from model.answer.stimulus import Finger, Placement
 from model.finger import detection_threshold, fingertips_on
-from model.structure.attachments import with_patches
+from model.structure.fingertips import with_patches
 from model.table.table import LocalizationTable
 
 BEING_CHOSEN = "its vibration is being chosen; wait a moment"

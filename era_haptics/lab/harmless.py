@@ -41,7 +41,7 @@ from model.fem import ELEMENTS
 from model.finger import THRESHOLDS
 from model.rig.rig_file import example_rig_path
 from model.rig.sections import RigSection
-from model.spectral.modes import POLYNOMIALS
+from model.spectral.plate_mesh import POLYNOMIALS
 from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
 
 HIDDEN = "hidden"

@@ -20,7 +20,7 @@ from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.files.csv_file import as_frame
 from model.finger import decibels
-from model.structure.attachments import Source
+from model.structure.sources import Source
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes
 from model.transients.excursions import Swing

@@ -55,7 +55,7 @@ from model.arrays import NEARLY, Point, best_by
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
-from model.structure.attachments import with_patches
+from model.structure.fingertips import with_patches
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5

@@ -32,7 +32,7 @@ import numpy as np
 from model.answer.envelope import ONSET_RAMP, Course, pulse_ramp, swings_of_pulse
 from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
 from model.drive_modes import UNRESTRICTED
-from model.structure.attachments import Source
+from model.structure.sources import Source
 from model.transients.excursions import Swing
 from model.vibration import Excitation, Tone
 

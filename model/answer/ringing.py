@@ -12,7 +12,7 @@ from model.answer.question import Contents
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.drive_forms import Forms, WeightedTones
 from model.finger import detection_threshold
-from model.structure.attachments import fingertip_loads
+from model.structure.fingertips import fingertip_loads
 from model.table.table import LocalizationTable, read_fingertips
 from model.transients.time_response import enveloped_accelerations
 

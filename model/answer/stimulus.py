@@ -17,7 +17,7 @@ from model.arrays import Point
 from model.config.units import in_meters
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
-from model.structure.attachments import check_loads
+from model.structure.fingertips import check_loads
 from model.structure.plate import Plate
 from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD, MAX_HAND_LOAD
 

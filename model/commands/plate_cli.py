@@ -103,7 +103,7 @@ def plate_map(
 ) -> None:
     """Compute peak acceleration over the plate for any drive."""
     from model.rig.rig_file import load_rig
-    from model.structure.attachments import support_problem
+    from model.structure.statics import support_problem
     from model.vibration import plate_map as solve
 
     inches = figure_size(size)

@@ -48,16 +48,8 @@ import numpy as np
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.ensemble.draws import standard_normal
 from model.rig.rig import Uncertainty
-from model.structure.attachments import (
-    HAND_STD,
-    Fingertip,
-    PointLoad,
-    Source,
-    attached_stiffness,
-    coupled_forces,
-    drive_forces,
-    feet_of,
-)
+from model.structure.attachments import PointLoad, attached_stiffness, coupled_forces, feet_of
+from model.structure.fingertips import HAND_STD, Fingertip
 from model.structure.modal_elasticity import (
     Dispersion,
     ModalElasticity,
@@ -65,6 +57,7 @@ from model.structure.modal_elasticity import (
     modal_receptance,
 )
 from model.structure.plate import Plate
+from model.structure.sources import Source, drive_forces
 from registry.limits import MAX_FINGER_LOAD
 
 LEAST_THICKNESS = 0.1

@@ -22,7 +22,8 @@ from model.estimate.hypotheses import Hypothesis
 from model.estimate.load_search import Load, match_with_form
 from model.estimate.plate_match import FALSE_ALARM, MAX_FIT_ERROR, Match
 from model.quantities import counted, in_display_unit, percent
-from model.structure.attachments import FingertipLoad, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import FingertipLoad
 
 MAX_FORM_ERROR = 0.05
 """Largest unexplained share of the responses of a plate that form errors explain."""

@@ -43,12 +43,7 @@ from model.reduction.attachment_points import AttachmentPoints, Modes, places_of
 from model.reduction.form_modes import ReducedModes
 from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
 from model.rig.rig import Rig
-from model.structure.attachments import (
-    attached_stiffness,
-    coupled_forces,
-    drive_forces,
-    footprints_of,
-)
+from model.structure.attachments import attached_stiffness, coupled_forces, footprints_of
 from model.structure.exciter import Actuator
 from model.structure.modal_elasticity import (
     WITHOUT_PART,
@@ -57,6 +52,7 @@ from model.structure.modal_elasticity import (
     lowest_elastic,
 )
 from model.structure.plate import LOSS_FREQUENCY
+from model.structure.sources import drive_forces
 
 SENSOR_FOOT = 5e-3
 """Radius of the disc on which a sensor's mass acts [m]; a plate is soft under a point."""

@@ -21,7 +21,6 @@ from model.estimate.plate_match import FALSE_ALARM, MAX_FIT_ERROR, Match, likeli
 from model.estimate.sensed_plate import SensedPlate, sensed_plate
 from model.estimate.shape_match import modal_assurance
 from model.rig.rig import Rig
-from model.spectral.modes import stretched
 from model.structure.exciter import Actuator
 
 # Factors on sizes, stiffnesses and loss factors, so close that a local search finds the best factor
@@ -181,7 +180,7 @@ def _resized(rig: Rig, *, length: float, width: float) -> Rig:
         plate=plate,
         eras=tuple(replace(era, x=era.x * length, y=era.y * width) for era in rig.eras),
         masses=tuple(replace(mass, x=mass.x * length, y=mass.y * width) for mass in rig.masses),
-        mesh=stretched(rig.mesh, plate),
+        mesh=rig.mesh.stretched(plate),
     )
 
 

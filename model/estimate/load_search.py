@@ -10,7 +10,8 @@ from model.arrays import best_by
 from model.estimate.plate_match import Match, match_plate
 from model.estimate.sensed_plate import plate_of
 from model.finger import Grid
-from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import Fingertip, FingertipLoad
 
 Load: TypeAlias = PointLoad | FingertipLoad
 """Load that can lie on a plate."""

@@ -41,9 +41,9 @@ from model.files.uff import (
     write_universal,
 )
 from model.rig.rig import Rig
-from model.structure.attachments import GRAVITY
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
+from model.structure.statics import GRAVITY
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3

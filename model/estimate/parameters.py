@@ -33,8 +33,9 @@ from model.estimate.parameter_space import (
 )
 from model.finger import Grid
 from model.rig.rig import Uncertainty
-from model.structure.attachments import FEET_DEVIATE, damping_from_ratio
+from model.structure.attachments import FEET_DEVIATE
 from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_EXPONENT, MAX_LOSS_FACTOR
+from model.structure.sources import damping_from_ratio
 
 MASS_CELLS = Grid(8, 6)
 """Possible positions of foreign mass."""

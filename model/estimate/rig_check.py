@@ -54,8 +54,10 @@ from model.estimate.plate_match import (
 from model.estimate.sensed_plate import SensedPlate, plate_of
 from model.estimate.shape_match import ShapeMatch, match_responses, match_shapes
 from model.rig.rig import Rig
-from model.structure.attachments import GRAVITY, Era, PointLoad
+from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
+from model.structure.sources import Era
+from model.structure.statics import GRAVITY
 from model.study.expected_contrast import promise_margins
 
 STRONG = 1.25

@@ -15,9 +15,10 @@ from model.arrays import FloatArray
 from model.estimate.parameter_space import MODE_SHIFTS, PlateValues, SearchScope, Space
 from model.estimate.parameters import PARAMETER_KINDS
 from model.rig.rig import Rig, Uncertainty
-from model.structure.attachments import Gain, PointLoad
+from model.structure.attachments import PointLoad
 from model.structure.exciter import Actuator
 from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.structure.sources import Gain
 
 _AT_EDGE = 1e-6  # m
 _MIN_MASS = 1e-5  # kg; a lighter one is not written to a rig

@@ -34,7 +34,7 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_mesh import mesh_of
 from model.spectral.direct_solution import grain_slopes
-from model.spectral.modes import PlateMesh, SpectralMesh
+from model.spectral.plate_mesh import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_is_plate, lowest_elastic
 from model.structure.plate import Plate
 

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from model.figures.style import COLORS, PAGE_WIDTH, SMALL_TEXT, TITLE_TEXT, draw_eras, label_plate
 from model.rig.rig import Rig
-from model.structure.attachments import Source
 from model.structure.plate import Plate
+from model.structure.sources import Source
 from model.vibration import NULL_SHARE, Excitation, G, PlateMap
 
 POINTS_ALONG = 97

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from model.files.array_file import whole_or_nothing
 from model.files.output_paths import check_picture_name
-from model.structure.attachments import Source
+from model.structure.sources import Source
 
 COLORS = "viridis"
 

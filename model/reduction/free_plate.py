@@ -58,27 +58,19 @@ from model.fem import (
 from model.reduction.point_cache import PointCache
 from model.reduction.surface_modes import RESIDUAL_ORDER, SurfaceModes
 from model.spectral.modes import (
-    KnownModes,
     MaterialBand,
-    PlateMesh,
-    SpectralMesh,
     SpectralPlate,
-    UnresolvedCompliance,
-    compliance_between,
-    uncertain_compliance,
-    unresolved_at,
 )
+from model.spectral.plate_mesh import KnownModes, PlateMesh, SpectralMesh
 from model.spectral.polynomials import CLASSES, deflections_by_class
+from model.spectral.unresolved_compliance import UnresolvedCompliance, unresolved_at
 from model.structure.attachments import (
-    Source,
-    Support,
-    as_footprints,
+    Attachment,
     attached_stiffness,
-    check_footprints_on_plate,
     coupled_forces,
     footprints_of,
-    unit_accelerations,
 )
+from model.structure.footprints import as_footprints, check_footprints_on_plate
 from model.structure.modal_elasticity import (
     Dispersion,
     ModalElasticity,
@@ -87,6 +79,7 @@ from model.structure.modal_elasticity import (
     modal_receptance,
 )
 from model.structure.plate import Plate, short_wave_plate
+from model.structure.sources import Source, unit_accelerations
 
 
 def truncation_weights(
@@ -308,12 +301,9 @@ class SpectralModes:
 
     def _local(self, sources: _PointShapes, receivers: _PointShapes) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""
-        plate = self._local_plate
-        missing = compliance_between(plate, sources.unresolved, receivers.unresolved)
+        missing = sources.unresolved.shared_with(receivers.unresolved)
         if self._is_softer:
-            missing = missing + uncertain_compliance(
-                plate, sources.unresolved, receivers.unresolved
-            )
+            missing = missing + sources.unresolved.uncertainty(receivers.unresolved)
         return missing / self.largest_truncated
 
     def _observe(self, points: FloatArray) -> _PointShapes:
@@ -453,7 +443,7 @@ class FreePlate:
         frequencies: FloatArray,
         points: FloatArray,
         *,
-        loads: Sequence[Support] = (),
+        loads: Sequence[Attachment] = (),
     ) -> ComplexArray:
         """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and source: (f, n, p).
 
@@ -476,7 +466,7 @@ class FreePlate:
         points: FloatArray,
         frequencies: FloatArray,
         *,
-        loads: Sequence[Support] = (),
+        loads: Sequence[Attachment] = (),
         thickness: FloatArray | float = 1.0,
     ) -> tuple[ComplexArray, ComplexArray]:
         """Receptances [m/N] between places (..., f, c, c), and from them to points (..., f, c, p).

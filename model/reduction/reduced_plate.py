@@ -33,8 +33,8 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.spectral.modes import PlateMesh
-from model.structure.attachments import as_footprints
+from model.spectral.plate_mesh import PlateMesh
+from model.structure.footprints import as_footprints
 from model.structure.modal_elasticity import Dispersion, ModalElasticity
 from model.structure.plate import Plate
 

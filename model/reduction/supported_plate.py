@@ -41,16 +41,11 @@ from model.arrays import FloatArray
 from model.errors import InputError, shown
 from model.files.csv_file import as_frame
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.attachments import (
-    Fingertip,
-    FingertipLoad,
-    InTime,
-    PointLoad,
-    Source,
-    check_supported,
-    footprints_of,
-)
+from model.structure.attachments import InTime, PointLoad, footprints_of
+from model.structure.fingertips import Fingertip, FingertipLoad
 from model.structure.modal_elasticity import loss_factors
+from model.structure.sources import Source
+from model.structure.statics import check_supported
 
 
 class MotionMatrices(NamedTuple):

@@ -28,7 +28,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.reduction.point_cache import PointCache
-from model.structure.attachments import check_footprints_on_plate, mean_over
+from model.structure.footprints import check_footprints_on_plate, mean_over
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.structure.surface import (

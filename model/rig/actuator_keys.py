@@ -44,10 +44,10 @@ from model.rig.key_types import (
     name_among,
     place_on,
 )
-from model.structure.attachments import Era, Gain, damping_from_ratio
 from model.structure.exciter import Actuator, Exciter
 from model.structure.material import EXCITER_TYPES
 from model.structure.plate import Plate
+from model.structure.sources import Era, Gain, damping_from_ratio
 
 STIFF_MOUNT = 1e6
 """Stiffness [N/m] above which the local dent under a point force matters.

@@ -16,9 +16,10 @@ from typing import Any
 from model.config.document import Document
 from model.errors import InputError, expect_between
 from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
-from model.spectral.modes import PlateMesh
-from model.structure.attachments import FEET_DEVIATE, Fingertip, PointLoad, feet_of
+from model.spectral.plate_mesh import PlateMesh
+from model.structure.attachments import FEET_DEVIATE, PointLoad, feet_of
 from model.structure.exciter import Actuator
+from model.structure.fingertips import Fingertip
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.plugins import did_you_mean

@@ -8,7 +8,7 @@ from model.arrays import Point
 from model.quantities import counted
 from model.rig.rig import Rig
 from model.structure.attachments import DEFAULT_POINTS
-from model.structure.balance import Balance, balance_of
+from model.structure.statics import Balance, balance_of
 
 TOUCH_FORCE = 1.0
 """Force [N] of a firm touch, which should not tip a plate (docs/concepts/people.md)."""

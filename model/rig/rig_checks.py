@@ -25,7 +25,7 @@ from model.rig.sections import (
     SupportSection,
     UncertaintySection,
 )
-from model.spectral.modes import SpectralMesh
+from model.spectral.plate_mesh import SpectralMesh
 from model.structure.plate import Plate
 from model.structure.surface import LEAST_KNOWN
 from registry.plugins import did_you_mean

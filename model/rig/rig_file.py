@@ -27,8 +27,9 @@ from model.rig.rig import Channel, Rig, canonical_json, physics_of
 from model.rig.rig_checks import check_across, modes_file
 from model.rig.rig_mesh import mesh_of
 from model.rig.sections import FingertipSection, RigSection
-from model.structure.attachments import Fingertip, PointLoad
+from model.structure.attachments import PointLoad
 from model.structure.exciter import Actuator
+from model.structure.fingertips import Fingertip
 from model.structure.plate import Plate
 
 _BASE_KEYS = ("base", "base_fingerprint", "standard_errors")

@@ -6,7 +6,7 @@ from model.config.fields import Quantity
 from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError
 from model.fem import MITC4, Mesh, element_of
-from model.spectral.modes import (
+from model.spectral.plate_mesh import (
     MAX_DEGREE,
     MAX_POLYNOMIALS,
     POLYNOMIALS,

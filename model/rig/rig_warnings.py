@@ -11,10 +11,12 @@ from itertools import pairwise
 from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
 from model.rig.rig import Rig
 from model.rig.rig_summary import attachment_keys, exciters_of, sections_of
-from model.spectral.modes import KnownModes
-from model.structure.attachments import DEFAULT_POINTS, GRAVITY, Era, Gain, Source, least_points
+from model.spectral.plate_mesh import KnownModes
+from model.structure.attachments import DEFAULT_POINTS, least_points
 from model.structure.exciter import Exciter
 from model.structure.plate import slide_frequency
+from model.structure.sources import Era, Gain, Source
+from model.structure.statics import GRAVITY
 from model.structure.surface import WELL_KNOWN
 from registry.limits import GuardLimits
 

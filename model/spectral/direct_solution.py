@@ -21,7 +21,8 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.spectral.modes import SpectralMesh, SpectralPlate, layers_of, local_compliance
+from model.spectral.modes import SpectralPlate, layers_of
+from model.spectral.plate_mesh import SpectralMesh
 from model.spectral.polynomials import (
     CLASSES,
     ClassFunctions,
@@ -33,14 +34,9 @@ from model.spectral.polynomials import (
     edge_decays,
     follow,
 )
-from model.structure.attachments import (
-    Source,
-    Support,
-    as_footprints,
-    coupled_forces,
-    footprints_of,
-    unit_accelerations,
-)
+from model.spectral.unresolved_compliance import unresolved_at
+from model.structure.attachments import Attachment, coupled_forces, footprints_of
+from model.structure.footprints import as_footprints
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import (
     CrossSection,
@@ -51,6 +47,7 @@ from model.structure.plate import (
     shear_corrections,
     short_wave_plate,
 )
+from model.structure.sources import Source, unit_accelerations
 
 Responder: TypeAlias = Callable[..., ComplexArray]
 """Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).
@@ -66,7 +63,7 @@ def direct_spectral_acceleration(
     frequencies: FloatArray,
     points: FloatArray,
     *,
-    loads: Sequence[Support] = (),
+    loads: Sequence[Attachment] = (),
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and source: (f, n, p).
 
@@ -86,54 +83,60 @@ def direct_spectral_acceleration(
     receptance = np.empty((len(omega), len(places), count), dtype=complex)
     for number, frequency in enumerate(frequencies):
         local_plate = short_wave_plate(plate, shortest, frequency)
-        compliance = local_compliance(local_plate, degrees, places, attached)
+        unresolved = unresolved_at(local_plate, degrees, places)
+        compliance = unresolved.shared_with(unresolved_at(local_plate, degrees, attached))
         receptance[number] = compliance / (1 + 1j * float(loss_factors(plate, omega[number])))
-        plate_at_frequency = AtOneFrequency(plate, degrees, frequency)
+        spectral_plate = SpectralPlate(plate, degrees, frequency)
         for parity, shapes in zip(CLASSES, bases, strict=True):
-            D = plate_at_frequency.dynamic_stiffness(parity, frequency)
+            D = dynamic_stiffness(spectral_plate, parity, frequency)
             receptance[number] += shapes @ np.linalg.solve(D, shapes[:count].T)
     between, to_points = np.split(receptance, [count], axis=1)
 
-    def displacements(held: ComplexArray, driven: ComplexArray) -> ComplexArray:
-        """Return displacements (f, n, p) by forces on attachments of dynamic stiffnesses."""
-        forces = coupled_forces(between, held, driven)
+    def displacements(stiffness: ComplexArray, applied: ComplexArray) -> ComplexArray:
+        """Return displacements (f, n, p), from stiffnesses of attachments and forces on them."""
+        forces = coupled_forces(between, stiffness, applied)
         return np.asarray(to_points @ forces).swapaxes(1, 2)
 
     return unit_accelerations(sources, loads, omega, displacements)
 
 
-class AtOneFrequency(SpectralPlate):
-    """A plate in polynomials whose response is solved for."""
+def dynamic_stiffness(
+    plate: SpectralPlate, parity: tuple[int, int], frequency: float
+) -> ComplexArray:
+    """Force by deflection in the polynomials of a class at a frequency [Hz], (m, m)."""
+    functions = plate.functions(parity)
+    omega = 2 * math.pi * frequency
+    loss_factor = 1j * float(loss_factors(plate.plate, np.asarray(omega)))
+    real_moduli = list[float]()
+    imaginary_moduli = list[float]()
+    for layer in plate.layers:
+        own_modulus = layer.modulus(frequency)
+        modulus = own_modulus + loss_factor * own_modulus.real
+        real_moduli.append(modulus.real)
+        imaginary_moduli.append(modulus.imag)
+    elastic = plate.stiffness(functions, real_moduli)
+    lossy = plate.stiffness(functions, imaginary_moduli)
+    D: ComplexArray = np.asarray(elastic + 1j * lossy)
+    w = slice(0, functions.deflections)
+    along = slice(functions.deflections, None)
+    identity = np.eye(functions.size - functions.deflections)
+    D[along, along] -= omega**2 * along_mass(functions, plate.along_mass, identity)
+    D[w, w] -= omega**2 * plate.deflection_mass(functions)
+    condensed = D[w, w] - _yielding(D, functions.deflections)
+    gap = plate.plate.air_gap
+    if gap is None:
+        return np.asarray(condensed)
+    air = air_motion(functions, gap)
+    G = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
+    G -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
+    return np.asarray(condensed + G[w, w] - _yielding(G, functions.deflections))
 
-    def dynamic_stiffness(self, parity: tuple[int, int], frequency: float) -> ComplexArray:
-        """Force by deflection in the polynomials of a class at a frequency [Hz], (m, m)."""
-        functions = self.functions(parity)
-        omega = 2 * math.pi * frequency
-        loss_factor = 1j * float(loss_factors(self._plate, np.asarray(omega)))
-        real_moduli = list[float]()
-        imaginary_moduli = list[float]()
-        for layer in self._layers:
-            own_modulus = layer.modulus(frequency)
-            modulus = own_modulus + loss_factor * own_modulus.real
-            real_moduli.append(modulus.real)
-            imaginary_moduli.append(modulus.imag)
-        elastic = self.stiffness(functions, real_moduli)
-        lossy = self.stiffness(functions, imaginary_moduli)
-        D: ComplexArray = np.asarray(elastic + 1j * lossy)
-        w = slice(0, functions.deflections)
-        along = slice(functions.deflections, None)
-        identity = np.eye(functions.size - functions.deflections)
-        D[along, along] -= omega**2 * along_mass(functions, self._mass, identity)
-        D[w, w] -= omega**2 * self._inertia(functions)
-        condensed = D[w, w] - D[w, along] @ np.linalg.solve(D[along, along], D[along, w])
-        gap = self._plate.air_gap
-        if gap is None:
-            return np.asarray(condensed)
-        air = air_motion(functions, gap)
-        G = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
-        G -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
-        held_back = G[w, along] @ np.linalg.solve(G[along, along], G[along, w])
-        return np.asarray(condensed + G[w, w] - held_back)
+
+def _yielding(D: ComplexArray, count: int) -> ComplexArray:
+    """Decrease of the stiffness of the first unknowns because all others are free, (n, n)."""
+    w = slice(0, count)
+    free = slice(count, None)
+    return np.asarray(D[w, free] @ np.linalg.solve(D[free, free], D[free, w]))
 
 
 _STEP = 1e-4  # of Poisson's ratio: exact to its square

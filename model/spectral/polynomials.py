@@ -38,7 +38,7 @@ from numpy.polynomial.legendre import leggauss, legvander
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.structure.attachments import mean_over
+from model.structure.footprints import mean_over
 from model.structure.plate import AirGap, CrossSection
 
 EVEN, ODD = 1, -1

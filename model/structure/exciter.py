@@ -26,7 +26,8 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import MAX_VALUE, InputError, expect_values
-from model.structure.attachments import Era, Factor, InTime, PointLoad, Source
+from model.structure.attachments import InTime, PointLoad
+from model.structure.sources import Era, Factor, Source
 
 _MAX_LAG = 0.1
 

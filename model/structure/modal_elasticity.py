@@ -10,8 +10,9 @@ with frequency: their dispersion.
 they resolve.
 """
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -200,7 +201,17 @@ class Discretization(ABC):
 
     @abstractmethod
     def resolving(self, plate: Plate, frequency: float) -> Self:
-        """The coarsest of its kind that resolves a frequency [Hz]."""
+        """Return the coarsest of its kind that resolves a frequency [Hz]."""
+
+    def stretched(self, plate: Plate) -> Self:
+        """Return one of its kind that resolves the same on a plate of another size."""
+        nx = math.ceil(self.nx * max(plate.length / self.length, 1.0))
+        ny = math.ceil(self.ny * max(plate.width / self.width, 1.0))
+        return replace(self, nx=nx, ny=ny, length=plate.length, width=plate.width)
+
+    def interpolation_error(self, plate: Plate, frequency: float) -> float:
+        """Largest relative error of a wave between nodes; 0 if any point can be evaluated."""
+        return 0.0
 
     def highest_frequency(self, plate: Plate) -> float:
         """The highest frequency [Hz] whose bending waves in a plate it resolves."""

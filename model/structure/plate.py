@@ -350,18 +350,9 @@ class Plate(Sheet):
         )
 
     @property
-    def rigid_masses(self) -> tuple[float, float, float]:
-        """Mass [kg] of the bare rigid plate in heave and in both tilts.
-
-        In w = q0 + q1 (x / length - 1/2) + q2 (y / width - 1/2).
-        """
-        mass = self.surface_density * self.length * self.width
-        return mass, mass / 12, mass / 12
-
-    @property
     def mass(self) -> float:
         """Mass of the bare plate [kg]."""
-        return self.rigid_masses[0]
+        return self.surface_density * self.length * self.width
 
     @property
     def shear_rigidity(self) -> float:

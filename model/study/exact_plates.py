@@ -17,14 +17,8 @@ from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.draws import over_fingertips
 from model.rig.rig import Rig, Uncertainty
-from model.structure.attachments import (
-    FingertipLoad,
-    attached_stiffness,
-    coupled_forces,
-    feet_of,
-    fingertip_loads,
-    footprints_of,
-)
+from model.structure.attachments import attached_stiffness, coupled_forces, feet_of, footprints_of
+from model.structure.fingertips import FingertipLoad, fingertip_loads
 from model.structure.modal_elasticity import check_scales, lowest_elastic, modal_receptance
 from model.structure.surface import MAX_DEVIATING
 from model.table.table import LocalizationTable, read_fingertips

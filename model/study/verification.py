@@ -39,8 +39,9 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
-from model.spectral.modes import SpectralMesh
-from model.structure.attachments import FingertipLoad, fingertip_loads, footprints_of
+from model.spectral.plate_mesh import SpectralMesh
+from model.structure.attachments import footprints_of
+from model.structure.fingertips import FingertipLoad, fingertip_loads
 from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates, felt_on
 from model.table.table import LocalizationTable

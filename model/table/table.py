@@ -59,16 +59,11 @@ from model.finger import (
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Uncertainty, fingerprint_of
-from model.spectral.modes import PlateMesh
-from model.structure.attachments import (
-    Fingertip,
-    PointLoad,
-    fingertip_loads,
-    footprints_of,
-    mean_over,
-    object_load,
-)
+from model.spectral.plate_mesh import PlateMesh
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.exciter import Actuator, Exciter
+from model.structure.fingertips import Fingertip, fingertip_loads, object_load
+from model.structure.footprints import mean_over
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.switched_patterns import highest_levels

@@ -37,9 +37,10 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json, differences
 from model.rig.rig_mesh import parse_mesh
-from model.spectral.modes import PlateMesh
-from model.structure.attachments import check_supported, footprints_of
+from model.spectral.plate_mesh import PlateMesh
+from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import Dispersion, check_scales
+from model.structure.statics import check_supported
 from model.table.table import PAPER_GRID, LocalizationTable, Raster, default_drive_frequencies
 from model.vibration import estimate_error, finer_mesh
 from registry.wording import first_problem

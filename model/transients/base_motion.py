@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.attachments import Source
+from model.structure.sources import Source
 from model.vibration import Excitation
 
 

@@ -35,7 +35,8 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_summary import exciters_of
-from model.structure.attachments import PointLoad, Source, footprints_of
+from model.structure.attachments import PointLoad, footprints_of
+from model.structure.sources import Source
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
 from model.transients.time_response import PlateInTime, plate_in_time

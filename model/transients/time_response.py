@@ -42,14 +42,9 @@ from model.arrays import Complex64Array, ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate
 from model.reduction.supported_plate import modal_matrices, stretches
-from model.structure.attachments import (
-    Fingertip,
-    FingertipLoad,
-    PointLoad,
-    Source,
-    coupled_forces,
-    footprints_of,
-)
+from model.structure.attachments import PointLoad, coupled_forces, footprints_of
+from model.structure.fingertips import Fingertip, FingertipLoad
+from model.structure.sources import Source
 from model.transients.base_motion import BaseMotions, rise
 
 

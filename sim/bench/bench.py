@@ -21,15 +21,10 @@ from model.arrays import Point
 from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.attachments import (
-    FingertipLoad,
-    PointLoad,
-    Source,
-    check_loads,
-    footprints_of,
-    with_patches,
-)
+from model.structure.attachments import PointLoad, footprints_of
+from model.structure.fingertips import FingertipLoad, check_loads, with_patches
 from model.structure.plate import Plate
+from model.structure.sources import Source
 from model.transients.base_motion import Motion
 from registry import limits, threads
 from sim.amplifier.amplifier_clock import AmplifierClock, StraightClock

@@ -15,7 +15,7 @@ from model.errors import InputError
 from model.finger import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.attachments import Source
+from model.structure.sources import Source
 from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 
 from model.arrays import Point
-from model.structure.attachments import FingertipLoad
+from model.structure.fingertips import FingertipLoad
 from sim.plant.loaded_plate import LoadedPlate
 
 

@@ -19,9 +19,9 @@ from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.rig_mesh import mesh_of
-from model.spectral.modes import PlateMesh
-from model.structure.attachments import Fingertip, FingertipLoad, fingertip_loads
+from model.spectral.plate_mesh import PlateMesh
 from model.structure.exciter import Actuator
+from model.structure.fingertips import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.plate import Plate
 from model.study.exact_plates import Plates, draw_plates
 from model.vibration import finer_mesh

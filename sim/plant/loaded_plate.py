@@ -15,7 +15,9 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.attachments import FingertipLoad, PointLoad, Source
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import FingertipLoad
+from model.structure.sources import Source
 from model.transients.time_response import PlateInTime, plate_in_time
 
 TABLE_ROWS = 512

@@ -14,7 +14,9 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.attachments import FingertipLoad, PointLoad, Source
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import FingertipLoad
+from model.structure.sources import Source
 from model.transients.base_motion import BaseMotions, Motion
 from model.transients.time_response import ForcedVibration
 from sim.plant.loaded_plate import (

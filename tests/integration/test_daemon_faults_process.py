@@ -52,7 +52,8 @@ from model.finger import (
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.structure.attachments import FingertipLoad, footprints_of
+from model.structure.attachments import footprints_of
+from model.structure.fingertips import FingertipLoad
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import shaped

@@ -22,7 +22,7 @@ from model.arrays import FloatArray
 from model.fem import assemble
 from model.finger import fingertip_points
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, FingertipLoad
+from model.structure.fingertips import Fingertip, FingertipLoad
 from processes.firmware_machine import SESSION as BENCH_SESSION
 from processes.firmware_machine import arm_bench, keep_alive
 from processes.firmware_machine import play as play_at_once

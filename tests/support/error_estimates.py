@@ -19,10 +19,10 @@ from model.arrays import FloatArray
 from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_mesh import mesh_of
-from model.spectral.modes import SpectralMesh
-from model.structure.attachments import Era
+from model.spectral.plate_mesh import SpectralMesh
 from model.structure.material import Material
 from model.structure.plate import Plate
+from model.structure.sources import Era
 from model.vibration import estimate_error
 
 MAX_RATIO = 1.4

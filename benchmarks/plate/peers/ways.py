@@ -9,7 +9,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from benchmarks.plate.problem import Case, accelerations
 from model.arrays import ComplexArray, FloatArray
-from model.structure.attachments import mean_over
+from model.structure.footprints import mean_over
 
 TOLERANCE = 1e-6
 """Of the eigenvalues, relative."""

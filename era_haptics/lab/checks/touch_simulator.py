@@ -18,7 +18,7 @@ from model.arrays import NEARLY, FloatArray, Point
 from model.drive_modes import DRIVE_MODES, UNRESTRICTED
 from model.errors import InputError
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
-from model.structure.attachments import fingertip_loads
+from model.structure.fingertips import fingertip_loads
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.shaping import SAMPLE_RATE, Transients

@@ -15,7 +15,7 @@ from model.figures.template import Template, write_template
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_columns
 from model.quantities import counted
-from model.structure.attachments import rigid_body_frequencies, static_loads
+from model.structure.statics import rigid_body_frequencies, static_loads
 
 MAX_SHOWN = 10
 """Layouts in a summary; the CSV file contains all."""

@@ -41,7 +41,7 @@ from model.errors import (
 )
 from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
 from model.rig.rig import Rig
-from model.structure.attachments import MIN_RIGID_BODY_FREQUENCY, support_problem
+from model.structure.statics import MIN_RIGID_BODY_FREQUENCY, support_problem
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 

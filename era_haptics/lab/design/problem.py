@@ -37,9 +37,9 @@ from model.errors import InputError
 from model.rig.era_layouts import named_layouts
 from model.rig.key_types import Identifier
 from model.rig.rig import Rig
-from model.structure.attachments import rigid_body_frequencies, static_loads
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
+from model.structure.statics import rigid_body_frequencies, static_loads
 from model.table.table import default_drive_frequencies
 from registry.limits import MAX_CONTACTS, MAX_CONTENTS
 

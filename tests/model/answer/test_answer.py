@@ -18,7 +18,7 @@ from model.answer.promise import felt_amplitudes, loudest_power
 from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
 from model.errors import InputError
 from model.finger import detection_threshold
-from model.structure.attachments import HAND_PATCHES, HAND_STD
+from model.structure.fingertips import HAND_PATCHES, HAND_STD
 from model.study.exact_plates import Plates, draw_plates
 from model.table.table_file import build_table
 from registry.limits import HAND_LOAD

@@ -34,8 +34,9 @@ from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Channel, Uncertainty
-from model.structure.attachments import FingertipLoad, PointLoad, footprints_of
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.exciter import Exciter
+from model.structure.fingertips import FingertipLoad
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 

@@ -32,7 +32,7 @@ from model.estimate.measurement import sensors_at
 from model.estimate.sensed_plate import SensedPlate, sensed_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from model.spectral.modes import SpectralMesh
+from model.spectral.plate_mesh import SpectralMesh
 from model.structure.attachments import PointLoad
 
 FREQUENCIES = np.arange(40.0, 321.0, 40.0)

@@ -42,7 +42,7 @@ from model.rig.rig_file import example_rig_path, load_rig, rig_of
 from model.rig.rig_mesh import mesh_of
 from model.rig.rig_writing import document_for, save_fitted
 from model.spectral.direct_solution import direct_spectral_acceleration
-from model.spectral.modes import SpectralMesh
+from model.spectral.plate_mesh import SpectralMesh
 from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy

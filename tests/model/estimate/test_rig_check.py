@@ -57,7 +57,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.rig.rig_writing import change_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
-from model.spectral.modes import SpectralMesh
+from model.spectral.plate_mesh import SpectralMesh
 
 TONES = np.arange(91.0, 300.0, 20.0)
 NAMES = ("NE", "NW", "SW", "SE")

@@ -34,8 +34,8 @@ from model.reduction.reduced_plate import reduce_plate
 from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
-from model.spectral.modes import SpectralMesh
-from model.structure.attachments import Era, PointLoad, footprints_of
+from model.spectral.plate_mesh import SpectralMesh
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.material import Material
 from model.structure.plate import (
     LOSS_FREQUENCY,
@@ -45,6 +45,7 @@ from model.structure.plate import (
     Plate,
     equivalent_plate,
 )
+from model.structure.sources import Era
 from model.study.verification import verify_table
 from model.table.table_file import TableProblem, build_table
 from model.vibration import natural_modes

@@ -9,7 +9,8 @@ import pytest
 from kit.plates import make_paper_rig
 from model.rig.rig import Rig
 from model.rig.rig_balance import RigBalance
-from model.structure.attachments import GRAVITY, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.statics import GRAVITY
 
 RIG = make_paper_rig(12, 9)
 LENGTH, WIDTH = RIG.plate.length, RIG.plate.width

@@ -37,7 +37,8 @@ from model.rig.rig_writing import (
     save_rig,
 )
 from model.rig.sections import MassSection, SupportSection
-from model.structure.attachments import Fingertip, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import Fingertip
 from model.table.table_file import build_table
 
 # A line per value, so that every problem has a line of its own.

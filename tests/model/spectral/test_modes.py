@@ -29,10 +29,12 @@ from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_plate import supported_modes
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_mesh import mesh_of, parse_mesh
-from model.spectral.direct_solution import AtOneFrequency
-from model.spectral.modes import MaterialBand, SpectralMesh, SpectralPlate, local_compliance
+from model.spectral.direct_solution import dynamic_stiffness
+from model.spectral.modes import MaterialBand, SpectralPlate
+from model.spectral.plate_mesh import SpectralMesh
 from model.spectral.polynomials import air_motion
-from model.structure.attachments import Era, footprints_of
+from model.spectral.unresolved_compliance import unresolved_at
+from model.structure.attachments import footprints_of
 from model.structure.material import Material
 from model.structure.plate import (
     HEAT_RATIO,
@@ -44,6 +46,7 @@ from model.structure.plate import (
     Plate,
     equivalent_plate,
 )
+from model.structure.sources import Era
 from model.vibration import natural_modes
 
 RIG = make_paper_rig(12, 9)
@@ -253,7 +256,7 @@ def test_complex_modes_equal_a_complex_eigenproblem():
     The eigenvalue of the dynamic stiffness, solved at its own frequency without a modal space.
     """
     plate = panel((PANEL[0], replace(PANEL[1], loss_factor=1.0), PANEL[2]), loss_factor=0.0)
-    layered = AtOneFrequency(plate, (10, 8), 150.0)
+    layered = SpectralPlate(plate, (10, 8), 150.0)
     modes = layered.modes(
         (1, 1),
         shift=(2 * np.pi * 30) ** 2,
@@ -262,7 +265,7 @@ def test_complex_modes_equal_a_complex_eigenproblem():
     )
     for square, loss in list(zip(modes.eigenvalues, modes.losses, strict=True))[1:4]:
         frequency = np.sqrt(square) / (2 * np.pi)
-        D = layered.dynamic_stiffness((1, 1), frequency)
+        D = dynamic_stiffness(layered, (1, 1), frequency)
         inertia = plate.material.rho * plate.thickness
         K = D / inertia + square * np.eye(len(D))
         values = linalg.eigvals(K)
@@ -375,7 +378,7 @@ def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     ("low", "tolerances"),
     in_turn([(12, 9), (13, 10)], [(1.5e-3, 0.0, 0.05, 0.12), (1e-2, 5e-3, 0.25, 0.35)]),
 )
-def test_local_compliance_is_what_higher_degrees_add(low, tolerances):
+def test_unresolved_compliance_is_what_higher_degrees_add(low, tolerances):
     """Within 5 % of the receptance that degrees 48x36 add under points inside, odd or even.
 
     Within 12 % near edges, and 25 % and 35 % on feet on a plate so thick that shear matters most.
@@ -392,7 +395,8 @@ def test_local_compliance_is_what_higher_degrees_add(low, tolerances):
     for degrees in (low, (48, 36)):
         free = solve_free_plate(plate, SpectralMesh(*degrees, *sides), frequency_max=100.0)
         own, _ = free.receptances(footprints, points, np.array([50.0]))
-        local.append(np.diagonal(local_compliance(plate, degrees, footprints, footprints)))
+        unresolved = unresolved_at(plate, degrees, footprints)
+        local.append(np.diagonal(unresolved.shared_with(unresolved)))
         without.append(np.diagonal(own[0]).real - local[-1])
     added, expected = without[1] - without[0], local[0] - local[1]
     is_at_edge = (np.arange(12) >= 6) & (np.arange(12) < 10)

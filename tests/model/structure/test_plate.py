@@ -24,20 +24,10 @@ from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_plate import supported_modes
 from model.rig.rig import Rig
 from model.rig.rig_writing import rig as rig_by_keys
-from model.structure.attachments import (
-    GRAVITY,
-    Era,
-    Fingertip,
-    FingertipLoad,
-    PointLoad,
-    check_supported,
-    footprints_of,
-    mean_over,
-    rigid_body_frequencies,
-    static_loads,
-    support_problem,
-)
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.exciter import Exciter
+from model.structure.fingertips import Fingertip, FingertipLoad
+from model.structure.footprints import mean_over
 from model.structure.material import Material, Orthotropy, known_material, material
 from model.structure.plate import (
     AirGap,
@@ -52,6 +42,14 @@ from model.structure.plate import (
     shear_corrections,
     wave_rigidity,
     wavenumber_of,
+)
+from model.structure.sources import Era
+from model.structure.statics import (
+    GRAVITY,
+    check_supported,
+    rigid_body_frequencies,
+    static_loads,
+    support_problem,
 )
 from model.vibration import natural_modes, reference_mesh
 

@@ -29,12 +29,7 @@ from model.errors import InputError
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_writing import save_rig
-from model.structure.attachments import (
-    GRAVITY,
-    center_of_mass,
-    rigid_body_frequencies,
-    static_loads,
-)
+from model.structure.statics import GRAVITY, center_of_mass, rigid_body_frequencies, static_loads
 from model.structure.surface import is_within, rings_of
 from model.study.exact_plates import amplitudes_on, draw_plates
 from model.study.verification import verify_table

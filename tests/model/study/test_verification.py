@@ -27,7 +27,8 @@ from model.finger import Grid, detection_threshold, fingertip_points, fingertip_
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
-from model.structure.attachments import FingertipLoad, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import FingertipLoad
 from model.study.exact_plates import Plates, draw_plates, felt_on
 from model.study.verification import PromiseCheck, verify_table
 from model.table.table_file import build_table, load_table, save_table

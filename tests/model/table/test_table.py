@@ -16,7 +16,7 @@ from model.errors import InputError
 from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
-from model.structure.attachments import FingertipLoad
+from model.structure.fingertips import FingertipLoad
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.study.exact_plates import Plates, felt_on

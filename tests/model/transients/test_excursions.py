@@ -21,14 +21,10 @@ from model.reduction.supported_plate import modal_matrices, supported_modes
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
-from model.structure.attachments import (
-    Fingertip,
-    FingertipLoad,
-    fingertip_loads,
-    footprints_of,
-    rigid_body_frequencies,
-)
+from model.structure.attachments import footprints_of
 from model.structure.exciter import Exciter
+from model.structure.fingertips import Fingertip, FingertipLoad, fingertip_loads
+from model.structure.statics import rigid_body_frequencies
 from model.table.table_file import build_table
 from model.transients.base_motion import shaped
 from model.transients.excursions import (

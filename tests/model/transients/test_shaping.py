@@ -20,9 +20,9 @@ from model.arrays import lattice
 from model.errors import InputError
 from model.finger import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.attachments import Era
 from model.structure.material import material
 from model.structure.plate import Plate
+from model.structure.sources import Era
 from model.transients.base_motion import (
     BaseEnvelope,
     Envelopes,

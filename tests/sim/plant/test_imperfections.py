@@ -23,7 +23,8 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Channel, Rig, Uncertainty
-from model.structure.attachments import Fingertip, PointLoad
+from model.structure.attachments import PointLoad
+from model.structure.fingertips import Fingertip
 from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time

@@ -33,8 +33,10 @@ from model.errors import InputError
 from model.fem import Mesh, PlateMatrices, assemble
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
+from model.structure.attachments import footprints_of
+from model.structure.fingertips import Fingertip, FingertipLoad
 from model.structure.plate import Plate
+from model.structure.sources import Era
 from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
 from sim.plant.excited_plate import play

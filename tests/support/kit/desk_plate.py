@@ -37,8 +37,10 @@ from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_mesh import parse_mesh
-from model.structure.attachments import Era, FingertipLoad, fingertip_loads, footprints_of
+from model.structure.attachments import footprints_of
+from model.structure.fingertips import FingertipLoad, fingertip_loads
 from model.structure.plate import Plate
+from model.structure.sources import Era
 
 if TYPE_CHECKING:
     import jack

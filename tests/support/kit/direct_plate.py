@@ -15,11 +15,13 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray
 from model.fem import Mesh, PlateMatrices, assemble, factorize
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
-from model.spectral.modes import PlateMesh, SpectralMesh
-from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
+from model.spectral.plate_mesh import PlateMesh, SpectralMesh
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.exciter import Actuator, Exciter
+from model.structure.fingertips import FingertipLoad
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
+from model.structure.sources import Era
 
 
 def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:

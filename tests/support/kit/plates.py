@@ -32,17 +32,12 @@ from model.reduction.reduced_plate import reduce_plate
 from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, parse_rig
-from model.structure.attachments import (
-    Era,
-    Fingertip,
-    FingertipLoad,
-    Gain,
-    damping_from_ratio,
-    footprints_of,
-)
+from model.structure.attachments import footprints_of
 from model.structure.exciter import Exciter
+from model.structure.fingertips import Fingertip, FingertipLoad
 from model.structure.material import Material
 from model.structure.plate import Plate
+from model.structure.sources import Era, Gain, damping_from_ratio
 from model.study.exact_plates import Plates, harmonics_on, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import TableProblem, build_table, solve_table

@@ -23,9 +23,9 @@ from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.fem import Mesh
 from model.rig.rig import Channel, Rig
-from model.structure.attachments import Era
 from model.structure.material import Material
 from model.structure.plate import Plate
+from model.structure.sources import Era
 from model.table.table import LocalizationTable
 from model.vibration import Excitation
 from registry.limits import GuardLimits

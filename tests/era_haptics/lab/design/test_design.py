@@ -42,7 +42,9 @@ from model.processes import on_cluster, on_processes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
-from model.structure.attachments import Era, attached_stiffness, drive_forces, static_loads
+from model.structure.attachments import attached_stiffness
+from model.structure.sources import Era, drive_forces
+from model.structure.statics import static_loads
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Files of content that a test writes and reads."""
+"""Content files that a test writes and reads."""
 
 import json
 from collections.abc import Callable
@@ -13,12 +13,18 @@ from controller.content.pattern import Pattern
 
 @pytest.fixture
 def read(tmp_path: Path) -> Callable[..., Pattern]:
-    """Write a file of an ending, text, bytes or an object as JSON, and read it."""
+    """Return a function that writes a file with an ending and reads it.
 
-    def write_and_read(ending: str, given: Any, channel: int | None = None) -> Pattern:
+    Its content is text, bytes, or an object that becomes JSON.
+    """
+
+    def write_and_read(ending: str, content: Any, channel: int | None = None) -> Pattern:
         path = tmp_path / f"content.{ending}"
-        text = given if isinstance(given, str | bytes) else json.dumps(given, indent=1)
-        path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            text = content if isinstance(content, str) else json.dumps(content, indent=1)
+            path.write_text(text, "utf-8")
         return read_content(path, channel)
 
     return write_and_read

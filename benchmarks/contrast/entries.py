@@ -33,7 +33,8 @@ from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.rig import Uncertainty
 from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.vibration import Excitation, Tone
 

@@ -20,7 +20,8 @@ from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.rig.rig_file import load_rig
 from model.study.exact_plates import draw_plates, powers_on
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 
 RIGS = ("paper_plate", "eight_eras", "car_display", "table")

@@ -26,7 +26,8 @@ from model.arrays import FloatArray
 from model.finger import FINGERTIP_RADIUS, decibels
 from model.structure.fingertips import Fingertip, FingertipLoad, object_load
 from model.study.exact_plates import Plates, accelerations_on, draw_plates
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.vibration import Excitation, base_amplitudes
 
 OBJECT_AWAY = 0.03  # m

@@ -22,7 +22,8 @@ from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
 from model.study.contact_sets import random_contacts
 from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_on
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 
 MARGIN = 0.02  # m; of fingers from the edge

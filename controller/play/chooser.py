@@ -29,7 +29,8 @@ from model.answer.adjustments import scaled
 from model.answer.answer import APART_HZ, Answer
 from model.arrays import NEARLY
 from model.errors import InputError
-from model.table.table import SAME_FREQUENCY, LocalizationTable
+from model.table.record import SAME_FREQUENCY
+from model.table.table import LocalizationTable
 from registry.plugins import failure_text
 from registry.threads import DaemonThreads
 

@@ -8,6 +8,7 @@ a session, which tests/docs/test_pages.py types.
 """
 
 import ast
+import dataclasses
 import inspect
 import re
 import textwrap
@@ -61,7 +62,18 @@ def _tree(thing: Any) -> ast.stmt:
     tree = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
     if isinstance(tree, ast.ClassDef):
         tree.body = [_unwrapped(thing, member) for member in tree.body]
+        text, *members = tree.body
+        for base in thing.__bases__:
+            if dataclasses.is_dataclass(base):
+                members = [*_class_body(base)[1:], *members]
+        tree.body = [text, *members]
     return tree
+
+
+def _class_body(kind: Any) -> list[ast.stmt]:
+    """The members of a class, its docstring first."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    return tree.body if isinstance(tree, ast.ClassDef) else []
 
 
 def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:

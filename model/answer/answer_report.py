@@ -47,7 +47,8 @@ from model.finger import (
     is_beyond,
 )
 from model.structure.plate import Plate
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
 from model.transients.shaping import Shaper, Transients
 from registry.wording import first_problem

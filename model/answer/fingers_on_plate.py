@@ -15,7 +15,8 @@ from model.ensemble.draws import Drawing, over_fingertips
 from model.ensemble.expected_power import outer
 from model.ensemble.kernel_plates import touch
 from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate
-from model.table.table import FingertipShapes, LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import FingertipShapes, fingertips_by_numpy, read_fingertips
+from model.table.table import LocalizationTable
 
 CENTER_AND_RIM = np.array([0, *range(9, 21)])
 """Indices of fine points of a fingertip, so close that no null fits between them."""
@@ -80,10 +81,8 @@ class FingersOnPlate:
         loads: relative to the rig's fingertip, empty for 1 each; by_kernel: whether to use C
         kernels.
         """
-        if by_kernel:
-            tips = read_fingertips(table, places)
-        else:
-            tips = table.raster.fingertips(np.array(places), table.shapes)
+        read = read_fingertips if by_kernel else fingertips_by_numpy
+        tips = read(table, places)
         centers = tips.few[:, 0]
         finger_count = len(centers)
 

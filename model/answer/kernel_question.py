@@ -45,7 +45,8 @@ from model.drive_modes import UNRESTRICTED
 from model.ensemble.draws import JUDGING_DRAWS, PERCENTILE, PROMISED_DRAWS
 from model.ensemble.expected_power import RIDGE
 from model.ensemble.kernel_plates import draws_structure, plates_structure
-from model.table.table import LocalizationTable, given_raster
+from model.table.fingertip_shapes import given_raster
+from model.table.table import LocalizationTable
 
 _T = TypeVar("_T")
 

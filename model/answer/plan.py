@@ -56,7 +56,8 @@ from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
 from model.structure.fingertips import with_patches
-from model.table.table import SAME_FREQUENCY, LocalizationTable
+from model.table.record import SAME_FREQUENCY
+from model.table.table import LocalizationTable
 
 MAX_SEPARATE = 5
 """Maximum number of sharing fingers that first get separate vibrations.

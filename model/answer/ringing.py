@@ -13,7 +13,8 @@ from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.drive_forms import Forms, WeightedTones
 from model.finger import detection_threshold
 from model.structure.fingertips import fingertip_loads
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.transients.time_response import enveloped_accelerations
 
 _MAX_DISTANCE = 60.0  # Hz; of the tones that represent a drive

@@ -44,7 +44,8 @@ from model.phased_weights import (
     search_to_level,
 )
 from model.switched_patterns import find_switched, max_sensation_switched
-from model.table.table import SAME_FREQUENCY, LocalizationTable
+from model.table.record import SAME_FREQUENCY
+from model.table.table import LocalizationTable
 
 MAX_BY_POINT = 8
 """Frequencies at which weights over a duration are also searched with the points of fingertips."""

@@ -21,7 +21,8 @@ from model.structure.attachments import attached_stiffness, coupled_forces, feet
 from model.structure.fingertips import FingertipLoad, fingertip_loads
 from model.structure.modal_elasticity import check_scales, lowest_elastic, modal_receptance
 from model.structure.surface import MAX_DEVIATING
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.vibration import Excitation, base_amplitudes
 
 

@@ -41,7 +41,8 @@ from model.spectral.plate_mesh import PlateMesh
 from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import Dispersion, check_scales
 from model.structure.statics import check_supported
-from model.table.table import PAPER_GRID, LocalizationTable, Raster, default_drive_frequencies
+from model.table.raster import Raster
+from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
 from model.vibration import estimate_error, finer_mesh
 from registry.wording import first_problem
 
@@ -277,7 +278,7 @@ def _check_arrays(table: LocalizationTable) -> None:
 
 
 def _check_positions(table: LocalizationTable) -> None:
-    """Raise InputError for ERAs and masses beside the plate."""
+    """Raise InputError for ERAs and masses off the plate."""
     for attachment in (*table.eras, *table.masses):
         x, y = attachment.x, attachment.y
         if not (0 <= x <= table.plate.length and 0 <= y <= table.plate.width):

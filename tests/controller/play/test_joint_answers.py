@@ -42,7 +42,8 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates, harmonics_on, powers_on
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from registry import threads
 from sim.far_ends.wire_assignment import SimulatedWire

@@ -21,7 +21,9 @@ from model.structure.material import Material
 from model.structure.plate import Plate
 from model.study.exact_plates import Plates, felt_on
 from model.switched_patterns import highest_levels
-from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.raster import Raster
+from model.table.table import LocalizationTable, default_drive_frequencies
 from model.table.table_file import TableProblem, build_table
 from model.vibration import Tone, tone_fields
 from registry.limits import GuardLimits
@@ -162,7 +164,9 @@ def test_for_plate_handles_thin_and_small_plates(thickness):
     plate = Plate(0.02, 0.03, thickness, Material("any", E=70e9, rho=2700.0, nu=0.33))
     raster = Raster.for_plate(plate, frequency_max=500.0)
     heights = (3 * raster.points[:, :1] - raster.points[:, 1:]).astype(np.float32)
-    np.testing.assert_allclose(raster.at(heights, np.array([[0.011, 0.004]])), [[0.029]], rtol=1e-5)
+    np.testing.assert_allclose(
+        raster.interpolated(heights, np.array([[0.011, 0.004]])), [[0.029]], rtol=1e-5
+    )
     with pytest.raises(InputError, match="6 to"):  # five points carry no quintic
         Raster(5, 9, 0.1, 0.1)
 

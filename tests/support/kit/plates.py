@@ -39,7 +39,8 @@ from model.structure.material import Material
 from model.structure.plate import Plate
 from model.structure.sources import Era, Gain, damping_from_ratio
 from model.study.exact_plates import Plates, harmonics_on, powers_on
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.fingertip_shapes import read_fingertips
+from model.table.table import LocalizationTable
 from model.table.table_file import TableProblem, build_table, solve_table
 from model.transients.base_motion import Motion as BaseMotionMotion
 from model.transients.base_motion import Term, along_lines, raised_cosine

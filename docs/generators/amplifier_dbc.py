@@ -1,6 +1,7 @@
 """The DBC file of an amplifier and its host, for bus monitors.
 
-Frames are words: what a word means depends on the message. ASCII only, as DBC readers need it.
+Signals are the words of a frame, because their meaning depends on the message. The file is ASCII,
+the only encoding that all DBC readers accept.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,7 +30,7 @@ _VALUES: Mapping[str, Mapping[str, int]] = {
 
 @dataclass(frozen=True)
 class _Signal:
-    """A field of a frame: first bit and number of bits; mark: of what it is multiplexed by."""
+    """A signal of a frame: first bit, number of bits, and its multiplexer indicator (`mark`)."""
 
     name: str
     first: int
@@ -38,7 +39,7 @@ class _Signal:
 
 
 def _words() -> Iterator[_Signal]:
-    """Yield the fields of the frames of a message, by the index in byte 1."""
+    """Yield the signals of the frames of a message, multiplexed by the index in byte 1."""
     yield _Signal("number", 0, 8)
     yield _Signal("frame", 8, 8, "M ")
     yield _Signal("type", 16, 8, "m0 ")
@@ -52,7 +53,7 @@ def _words() -> Iterator[_Signal]:
 
 
 def dbc_text(*, node: int = 1) -> str:
-    """Return the frames between the host and an amplifier at a node."""
+    """Return the DBC file for the host and an amplifier with a node number."""
     words = (*_words(),)
     emergency = (
         *(_Signal("code", 0, 16), _Signal("error_register", 16, 8), _Signal("state", 24, 4)),

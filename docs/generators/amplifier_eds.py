@@ -1,4 +1,4 @@
-"""The electronic data sheet (CiA 306) of an amplifier of protocol 4: its objects are words."""
+"""The electronic data sheet (CiA 306) of an amplifier with protocol 4."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +14,7 @@ _MANDATORY, _OWN = (0x1000, 0x1001, 0x1018), 0x2000
 
 
 def eds_text(*, channels: int = 4, layers: int = 8) -> str:
-    """Return the data sheet of an amplifier with a number of channels and of layers."""
+    """Return the data sheet of an amplifier with these numbers of channels and layers."""
     counts = {"channels": channels, "layers": layers}
     numbers = {
         "vendor_id": f"0x{CANOPEN['vendor_id']:X}",
@@ -82,7 +82,7 @@ def _words(
 def _several(
     index: int, name: str, entries: Sequence[tuple[str, str, str | None]], access: str = "const"
 ) -> list[str]:
-    """Return an object with entries: name, type, default."""
+    """Return an object with entries (name, type, default)."""
     kind = _ARRAY if len({each[1] for each in entries}) == 1 else _RECORD
     head = {"ParameterName": name, "ObjectType": f"0x{kind:X}", "SubNumber": len(entries) + 1}
     lines = [

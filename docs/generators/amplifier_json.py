@@ -1,6 +1,6 @@
-"""The protocol as data, for machines on serial lines and Modbus: docs/reference/amplifier.json.
+"""The protocol on serial lines and Modbus as JSON: docs/reference/amplifier.json.
 
-Every number is that of `drivers.protocol.definition` or of the wire that has it.
+All numbers are from `drivers.protocol.definition` and from the wires.
 """
 
 import json
@@ -70,7 +70,7 @@ _SERIAL: Mapping[str, Any] = {
 
 
 def json_text() -> str:
-    """Return the whole file."""
+    """Return the JSON file."""
     return json.dumps(_protocol(), indent=1, ensure_ascii=False) + "\n"
 
 
@@ -141,13 +141,13 @@ def _fields(record: Record) -> list[dict[str, Any]]:
 
 
 def _field(field: object) -> dict[str, Any]:
-    """Return a field: its kind says how many words it has and what they are."""
+    """Return a field; its kind determines the number and the type of its words."""
     match field:
         case Number(name=name, quantity=quantity, is_added=is_added):
             added = {"added": True} if is_added else {}
             return {"name": name, "kind": "number", "quantity": quantity.name, **added}
         case Bits(parts=parts):
-            # From the highest bits of the word that are used to the lowest.
+            # From the highest to the lowest used bits of the word.
             return {"kind": "bits", "parts": [{"name": each, "bits": bits} for each, bits in parts]}
         case Text(name=name):
             return {"name": name, "kind": "text"}

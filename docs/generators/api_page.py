@@ -1,4 +1,4 @@
-"""The reference part of reference/api.md: methods, topics, types and errors of the API."""
+"""The reference in docs/reference/api.md: methods, topics, types and errors of the API."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -11,7 +11,7 @@ from message_types import Models, Notation, each_model
 
 
 def api_reference() -> str:
-    """All lists, as Markdown."""
+    """Return all lists, as Markdown."""
     models: Models = {}
     lines = [
         "### Methods",
@@ -38,7 +38,7 @@ def api_reference() -> str:
 
 
 def _notes(method: Method) -> Iterator[str]:
-    """Who may call a method, and how its requests are treated."""
+    """Yield who may call a method, and how its requests are handled."""
     lease = method.params.model_fields.get("lease")
     if lease is not None and lease.is_required():
         yield "Needs the current lease."
@@ -53,7 +53,7 @@ def _notes(method: Method) -> Iterator[str]:
 
 
 def _rows(prefix: str, model: type[ApiMessage], models: Models) -> Iterator[str]:
-    """One row per field; collects the models that fields are made of."""
+    """Yield a row for each field; add the models of the fields to `models`."""
     descriptions = model.descriptions()
     for name, field in model.model_fields.items():
         kind = _TYPES.type_of(field.rebuild_annotation(), models)
@@ -65,7 +65,7 @@ def _rows(prefix: str, model: type[ApiMessage], models: Models) -> Iterator[str]
 
 
 def _data(model: type[ApiMessage], models: Models) -> Iterator[str]:
-    """The rows of a topic; what `status` returns as well is one of them."""
+    """Yield the rows of a topic; fields that `status` also returns share a row."""
     status = set(_rows("", METHODS["status"].result, models))
     rows = list(_rows("", model, models))
     same = [row.split(" (")[0].removeprefix("- ") for row in rows if row in status]

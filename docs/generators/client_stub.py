@@ -1,7 +1,7 @@
-"""Parts of `controller/api` that are written from the table of methods, handlers and readings.
+"""Generated parts of `controller/api`: the client's methods, summaries and readings.
 
-The docstrings of the handlers in `controller/daemon/handlers.py` are the summaries: clients and
-gateway do not load that module.
+The summaries are the docstrings of the handlers in `controller/daemon/handlers.py`, a module that
+clients and gateway do not load.
 """
 
 import textwrap
@@ -14,16 +14,16 @@ from controller.api.schema import Empty, one_line
 from controller.daemon.handlers import ApiService
 from drivers.protocol.definition import READINGS
 
-_WIDTH = 100  # of a line, as ruff has it
+_WIDTH = 100  # of a line, as in the configuration of ruff
 _BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
-"""Methods of `AsyncClient` that put parameters together from positions and names of topics."""
+"""Hand-written methods of `AsyncClient`, whose arguments differ from the parameters."""
 
 _CONSTANTS = ("DEFAULT_LEASE", "METHODS", "SILENCING")
-"""Names other than results that client.py imports from methods.py."""
+"""Names that client.py imports from methods.py in addition to result classes."""
 
 
 def registered() -> dict[str, tuple[Method, str]]:
-    """All methods by name, with the docstring of the handler on one line."""
+    """Return all methods by name, with the handler's docstring on one line."""
     methods = {}
     for name, method in METHODS.items():
         docstring = getattr(ApiService, name).__doc__ or ""
@@ -32,7 +32,7 @@ def registered() -> dict[str, tuple[Method, str]]:
 
 
 def summaries() -> str:
-    """The whole file summaries.py."""
+    """Return the file summaries.py."""
     lines = [
         "# Written by docs/generators/client_stub.py.",
         "# ruff: noqa: E501",
@@ -49,7 +49,7 @@ def summaries() -> str:
 
 
 def _readings() -> str:
-    """The fields of an amplifier's status that are readings of the protocol, in schema.py."""
+    """Return the fields of an amplifier's status that are readings, for schema.py."""
     lines = []
     for reading in READINGS:
         default = " = None" if reading.is_added else ""
@@ -64,7 +64,7 @@ def _readings() -> str:
 
 
 def _results() -> str:
-    """The import of everything that client.py needs of methods.py."""
+    """Return the import statement of client.py for methods.py."""
     classes = {method.result.__name__ for method in METHODS.values()} - {"Empty"}
     names = [*_CONSTANTS, *sorted(classes)]
     lines = ["from controller.api.methods import (", *(f"    {name}," for name in names), ")"]
@@ -72,7 +72,7 @@ def _results() -> str:
 
 
 def _methods() -> str:
-    """The methods of `AsyncClient` that are one request each."""
+    """Return the methods of `AsyncClient` that send a single request."""
     return "\n\n".join(
         "\n".join(_method(name, method, summary))
         for name, (method, summary) in registered().items()
@@ -108,7 +108,7 @@ def _docstring(lines: list[str]) -> Iterator[str]:
 
 
 def _parameters(method: Method) -> Iterator[str]:
-    """The parameters: required and marked ones by position or name, all others by name alone."""
+    """Yield the parameters; optional ones can only be given by name, unless marked otherwise."""
     fields = sorted(method.params.model_fields.items(), key=lambda item: not item[1].is_required())
     is_by_place = True
     for name, field in fields:
@@ -120,7 +120,7 @@ def _parameters(method: Method) -> Iterator[str]:
 
 
 def _kind(annotation: Any) -> str:
-    """A type as Python."""
+    """Return a type as Python code."""
     if get_origin(annotation) is Annotated:
         return _kind(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -129,7 +129,7 @@ def _kind(annotation: Any) -> str:
 
 
 def _blocking() -> str:
-    """The methods of `Client`."""
+    """Return the methods of `Client`."""
     return "\n".join(f"    {name} = _blocking(AsyncClient.{name})" for name in registered())
 
 
@@ -137,4 +137,4 @@ PARTS: Mapping[str, Mapping[str, Callable[[], str]]] = {
     "schema": {"readings": _readings},
     "client": {"results": _results, "methods": _methods, "blocking": _blocking},
 }
-"""The writers of a module of `controller/api`, by module and name of the part."""
+"""Writers of the generated parts of `controller/api`, by module and part name."""

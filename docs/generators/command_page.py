@@ -1,6 +1,6 @@
 """The reference in docs/reference/commands.md: every command with its arguments and options.
 
-What many commands have stands once, above them.
+Common arguments and options are listed once, at the beginning.
 """
 
 from collections import Counter
@@ -14,13 +14,13 @@ from era_haptics.command import command_modules
 from registry.command_line import join_commands
 
 _MANY = 6
-"""So many commands with the same argument or option: it is a common one."""
+"""Number of commands from which on an argument or option that they share is common."""
 
 _Records = list[tuple[str, str]]
 
 
 def command_reference() -> str:
-    """All commands in the order of `era --help`, as Markdown."""
+    """Return all commands in the order of `era --help`, as Markdown."""
     group, _ = join_commands(command_modules())
     commands = list(_commands(group, typer.Context(group, info_name="era")))
     counts = Counter(record for *_, records in commands for record in records)
@@ -39,7 +39,7 @@ def command_reference() -> str:
 def _commands(
     group: TyperGroup, context: typer.Context
 ) -> Iterator[tuple[str, str, str, _Records]]:
-    """Of every command its full name, usage, summary, and its arguments and options."""
+    """Yield the full name, usage, summary, and arguments and options of each command."""
     for name in group.list_commands(context):
         command = group.commands[name]
         inner = typer.Context(command, info_name=name, parent=context)
@@ -59,7 +59,7 @@ def _described(command: Any, context: typer.Context) -> tuple[str, str, str, _Re
 def _entry(
     path: str, usage: str, summary: str, records: _Records, common: dict[str, str]
 ) -> Iterator[str]:
-    """The lines of one command: its summary, its usage, and what it does not share with others."""
+    """Yield the lines of a command: summary, usage, and arguments and options of its own."""
     is_common = [
         name in common and text.startswith(common[name].rstrip(".")) for name, text in records
     ]

@@ -14,6 +14,6 @@ def _row(check: ConformanceCheck) -> str:
 
 
 def checks() -> str:
-    """Return a row for each check, in their order of execution."""
+    """Return a row for each check, in the order of execution."""
     head = ("| check | stimulus: required reaction | rule | wires |", "|---|---|---|---|")
     return "\n".join((*head, *map(_row, CHECKS)))

@@ -2,7 +2,7 @@
 
     python docs/generators/constraints.py > constraints.txt
 
-Without development tools: of the plain installation and of the extras that users install.
+The output covers the plain installation and the extras for users, without development tools.
 """
 
 import sys
@@ -15,7 +15,7 @@ EXTRAS = ("gateway", "cluster", "sound", "frames")
 
 
 def closure(name: str, *extras: str) -> dict[str, str]:
-    """Versions of all that a distribution requires with these extras, by name."""
+    """Return versions of all dependencies of a distribution with these extras, by name."""
     found: dict[str, str] = {}
     pending = [(name, extras)]
     while pending:

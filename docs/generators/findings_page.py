@@ -4,6 +4,6 @@ from model.estimate.findings import FINDING_KINDS
 
 
 def finding_kinds() -> str:
-    """Return one row for each kind: its name, its subject and its criterion."""
+    """Return a row for each kind with its name, subject and criterion."""
     rows = [f"| {name} | {kind.about} | {kind.criterion} |" for name, kind in FINDING_KINDS.items()]
     return "\n".join(["| finding | about | reported if |", "|---|---|---|", *rows])

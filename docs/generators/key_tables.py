@@ -1,7 +1,7 @@
-"""Tables of keys: unit, default, limits and meaning of each, from the sections of a file.
+"""Tables of a configuration file's keys: unit, default, limits and meaning.
 
-A key's meaning stands below it in its class, in the words of the page; a paragraph that begins with
-`Default:` or `Limits:` says what the type does not.
+The docstring below a field of the section is its meaning. A paragraph that begins with `Default:`
+or `Limits:` replaces the value derived from the type.
 """
 
 import ast
@@ -23,7 +23,7 @@ HEAD = "| key | unit | default | limits | meaning |\n|---|---|---|---|---|"
 
 
 def key_rows(page: str, heading: str) -> dict[str, list[str]]:
-    """The table of keys under a heading of the second level: [unit, default, limits, meaning]."""
+    """Return the table below a second-level heading: [unit, default, limits, meaning] by key."""
     (text,) = [
         section
         for section in re.split(r"^## ", page, flags=re.MULTILINE)
@@ -35,14 +35,14 @@ def key_rows(page: str, heading: str) -> dict[str, list[str]]:
 
 
 def key_table(section: type[Section]) -> str:
-    """The table of all keys of a section."""
+    """Return the table of all keys of a section."""
     return "\n".join([HEAD, *rows_of(section)])
 
 
 def rows_of(section: type[Section], *, above: type[Section] = Section) -> Iterator[str]:
-    """A row for each key that a section has and the one above it has not, in their order.
+    """Yield a row for each key of a section that its parent section `above` lacks, in order.
 
-    Of a section that has one above it the name is before the key, as in `click.duration`.
+    If it has a parent, keys begin with the section's name, such as `click.duration`.
     """
     prefix = "" if above is Section else f"{section.__name__.lower()}."
     said = _docstrings(section)
@@ -63,14 +63,14 @@ def rows_of(section: type[Section], *, above: type[Section] = Section) -> Iterat
 
 
 def in_cell(docstring: str) -> str:
-    """The first paragraph, in one line, as a cell: without full stop and capital, but of names."""
+    """Return the first paragraph as a cell: no final period, lower case unless it is a name."""
     text = " ".join(docstring.split("\n\n")[0].split()).removesuffix(".")
     first = text.split(" ")[0]
     return text[0].lower() + text[1:] if first.istitle() and "'" not in first else text
 
 
 def bounds_in_words(asked: Quantity) -> str:
-    """Every finite bound of a quantity, in the words of the error."""
+    """Return all finite bounds of a quantity, worded like the error message."""
     bounds = {
         "above": asked.above,
         "at least": asked.at_least,
@@ -81,7 +81,7 @@ def bounds_in_words(asked: Quantity) -> str:
 
 
 def _docstrings(of: type) -> dict[str, str]:
-    """What stands below each field of a class and of sections that it extends, by its name."""
+    """Return the docstring of each field of a class and its parent sections, by name."""
     classes = [each for each in reversed(of.__mro__) if each is of or issubclass(each, Section)]
     found = dict[str, str]()
     for each in classes:
@@ -115,10 +115,10 @@ def _default(field: FieldInfo, quantity: Quantity | None) -> str:
 
 
 def _limits(field: FieldInfo) -> str:
-    """Choices, the range of a whole number, or how many entries there may be."""
+    """Return the choices, the range of an integer, or the allowed number of entries."""
     kind, bounds = field.annotation, field.metadata
     parts = get_args(kind)
-    if parts and parts[-1] is NoneType:  # of a key that may be left out
+    if parts and parts[-1] is NoneType:  # the key is optional
         kind = parts[0] if get_origin(parts[0]) is Literal else (get_args(parts[0]) or parts)[0]
         annotations = getattr(parts[0], "__metadata__", ())
         bounds = [own for each in annotations for own in getattr(each, "metadata", (each,))]

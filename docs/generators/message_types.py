@@ -1,4 +1,4 @@
-"""Types of the API's messages in a notation of a page's or a file's own."""
+"""Types of the API's messages, in the notation of a page or of another language."""
 
 import types
 from collections.abc import Callable, Iterator, Mapping
@@ -12,11 +12,11 @@ Models = dict[str, type[ApiMessage]]
 
 @dataclass(frozen=True)
 class Notation:
-    """How types are written: formats have `{}` for what is in them.
+    """A notation for types; formats contain `{}` for the inner type.
 
-    plain: names of types that are not messages; union, literals, items: between alternatives,
-    values and the members of a tuple; nested: an array or object inside an array or object;
-    bounds: of the metadata of an annotated type, appended.
+    plain: names of types that are not messages; union, literals, items: separators of alternatives,
+    values and tuple members; nested: format of an array or object inside another; bounds: returns
+    the text to append for the metadata of an annotated type.
     """
 
     plain: Mapping[Any, str]
@@ -31,7 +31,7 @@ class Notation:
     bounds: Callable[[tuple[object, ...]], str] = lambda metadata: ""
 
     def type_of(self, annotation: Any, models: Models) -> str:
-        """Write a type; collects the models that it is made of."""
+        """Return the notation of a type; add the models that it contains to `models`."""
         origin, arguments = get_origin(annotation), get_args(annotation)
         if origin is Literal:
             return self.literals.join(map(self.literal.format, arguments))
@@ -52,14 +52,14 @@ class Notation:
 
 
 def _is_nested(annotation: Any) -> bool:
-    """Return whether the items of an array or object are arrays or objects themselves."""
+    """Return whether an array or object contains arrays or objects."""
     if get_origin(annotation) is Annotated:
         return _is_nested(get_args(annotation)[0])
     return get_origin(annotation) in (list, dict)
 
 
 def each_model(models: Models) -> Iterator[tuple[str, type[ApiMessage]]]:
-    """Every model once, with those that are collected while the ones before are written."""
+    """Yield each model once, including models that are added during the iteration."""
     shown: set[str] = set()
     while left := [name for name in models if name not in shown]:
         for name in left:

@@ -1,6 +1,6 @@
 """The table of docs/reference/metrics.md: every metric that the gateway can serve.
 
-They are those of a status in which everything is known.
+The metrics are generated from a status in which every value is set.
 """
 
 import types
@@ -14,7 +14,7 @@ from controller.gateway.metrics import exposition
 
 
 def metrics() -> str:
-    """Return name, kind, labels and meaning of each."""
+    """Return a table with the name, type, labels and meaning of each metric."""
     text = exposition(_known(StatusResult)).decode()
     rows = ["| metric | kind | labels | |", "|---|---|---|---|"]
     for family in text_string_to_metric_families(text):
@@ -26,7 +26,7 @@ def metrics() -> str:
 
 
 def _known(annotation: Any) -> Any:
-    """Return a value of a type: of several that which says most, of a list one entry."""
+    """Return a value of a type: the most informative alternative, and one entry of a list."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Annotated, Literal):
         return arguments[0] if origin is Literal else _known(arguments[0])

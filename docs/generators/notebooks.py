@@ -1,9 +1,9 @@
-"""Notebooks in percent format as Markdown: text, cells, what they print, and their pictures.
+"""Convert notebooks in percent format to Markdown: text, code, output and pictures.
 
     python docs/generators/notebooks.py examples/researcher.py
 
-The directive `notebook` of the pages (docs/conf.py) runs this while they are built, and nothing of
-it is kept in the repository. A file without marks of cells is one cell.
+The directive `notebook` (docs/conf.py) runs this when the pages are built. A file without cell
+marks is a single cell.
 """
 
 import ast
@@ -20,19 +20,19 @@ _CELL = re.compile(r"^# %%( \[markdown\])?.*\n", re.MULTILINE)
 
 
 def cells(text: str) -> Iterator[tuple[bool, str]]:
-    """Whether a cell is text, and its source without the marks, for all cells of a notebook."""
+    """Yield for each cell whether it is text, and its source without the mark."""
     _, *parts = _CELL.split(text if _CELL.match(text) else f"# %%\n{text}")
     for is_text, source in zip(parts[::2], parts[1::2], strict=True):
         yield bool(is_text), source.strip().strip('"').strip() if is_text else source.strip()
 
 
 def as_markdown(notebook: Path, pictures: Path) -> str:
-    """Run all cells in one namespace, and return text, sources, output and links to pictures.
+    """Run all cells in a namespace; return text, sources, output and links to pictures.
 
-    A figure that ends a cell is kept as a file in `pictures`.
+    A figure at the end of a cell is saved as a file in `pictures`.
     """
     names: dict[str, Any] = {"__name__": "__main__", "__file__": str(notebook)}
-    sys.path.insert(0, str(notebook.parent))  # as for a program that Python runs
+    sys.path.insert(0, str(notebook.parent))  # like Python does for a script
     shown: list[str] = []
     for number, (is_text, source) in enumerate(cells(notebook.read_text("utf-8"))):
         if is_text:
@@ -52,7 +52,7 @@ def as_markdown(notebook: Path, pictures: Path) -> str:
 
 
 def _result(source: str, name: str, names: dict[str, Any]) -> Any:
-    """The value of a cell's last line, None where it has none, after all lines have been run."""
+    """Run a cell; return the value of its last line, None if it has no value."""
     tree = ast.parse(source, name)
     last = tree.body[-1] if tree.body else None
     if isinstance(last, ast.Expr):
@@ -64,7 +64,7 @@ def _result(source: str, name: str, names: dict[str, Any]) -> Any:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run a notebook, and print it as Markdown; pictures go to the folder of built pages."""
+    """Run a notebook and print it as Markdown; write its pictures to the folder of built pages."""
     pictures = ROOT / "docs" / "_build" / "notebooks"
     pictures.mkdir(parents=True, exist_ok=True)
     sys.argv = [*arguments]

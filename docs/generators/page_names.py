@@ -1,7 +1,7 @@
-"""Names of code on pages that a reader cannot find: private ones, and those that are gone.
+"""Find names of code on pages that are private, or that no longer exist.
 
-`make lint` lists them. Pages may name a class of the project with a public member of it. A private
-name changes whenever its module is rewritten; a page describes what it does, or names its module.
+`make lint` lists them. A page can name a class of the project and its public members. In place of a
+private name, which can change with any rewrite, a page describes the behavior or names the module.
 """
 
 import ast
@@ -54,12 +54,12 @@ def _wrong_in(line: str, classes: dict[str, _Class]) -> Iterator[str]:
 
 
 def _blank(block: re.Match[str]) -> str:
-    """Return as many empty lines as a block has."""
+    """Return as many line ends as a block contains."""
     return "\n" * block[0].count("\n")
 
 
 def _classes(root: Path) -> dict[str, _Class]:
-    """Return all classes of the project by name; those of one name together."""
+    """Return all classes of the project by name; classes with equal names are merged."""
     classes: dict[str, _Class] = defaultdict(_Class)
     for folder in SOURCES:
         for path in (root / folder).rglob("*.py"):

@@ -1,8 +1,8 @@
-"""Every page, part of a page, client stub and C header that is written from the code.
+"""Write every page, part of a page, client stub and C header that is generated from the code.
 
-`make pages` writes them. With `--check`, as in `make lint`, it lists the stale ones, and names of
-code on pages that are private or do not exist. What depends on a package index (constraints.txt,
-reference/licences.md) and what is measured (docs/measured) is written by targets of its own.
+`make pages` writes stale files. With `--check`, which `make lint` uses, this lists the stale files,
+and names of code on pages that are private or do not exist. Other targets write files that depend
+on a package index (constraints.txt, reference/licences.md) and measurements (docs/measured).
 """
 
 import os
@@ -41,24 +41,24 @@ ROOT = Path(__file__).parents[2]
 END = "<!-- end -->"
 
 Writer: TypeAlias = Callable[[str], str]
-"""From the present text of a file to the text that it must have."""
+"""Function from the current text of a file to its required text."""
 
 
 def whole(write: Callable[[], str]) -> Writer:
-    """The writer of a file of which nothing is written by hand."""
+    """Return the writer of a file that is generated as a whole."""
     return lambda _: write()
 
 
 def part(name: str, write: Callable[[], str]) -> Writer:
-    """The writer of what stands between the mark with this name and the next end of a part."""
+    """Return the writer of the part between the mark with this name and the next end mark."""
     return lambda page: insert(page, write(), name=name)
 
 
 def insert(page: str, text: str, *, name: str) -> str:
-    """The page with this text as its part of a name; ValueError for a page without its marks."""
+    """Return a page with a new text for a part; raises ValueError if its marks are missing."""
     begin = f"<!-- begin: written by {name} -->"
     marks = (rf"{begin}\n", rf"{END}\n")
-    if f"# begin: written by {name}\n" in page:  # of Python
+    if f"# begin: written by {name}\n" in page:  # in Python code
         marks = (rf"# begin: written by {name}\n", r" *# end\n")
     found = re.fullmatch(f"(.*{marks[0]}).*?({marks[1]}.*)", page, re.DOTALL)
     if found is None:
@@ -118,11 +118,11 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/how-to/simulated-hardware.md": _urls("far_ends"),
     "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
 }
-"""The writers of each file, by its path from the root."""
+"""Writers of each generated file, by path."""
 
 
 def main(arguments: Sequence[str], *, root: Path = ROOT) -> int:
-    """Write all files that are stale, or name them and return 1."""
+    """Write all stale files; with `--check`, list them and return 1."""
     is_check, status = "--check" in arguments, 0
     for name, writers in WRITTEN.items():
         path = root / name
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str], *, root: Path = ROOT) -> int:
             path.write_text(text, encoding="utf-8")
             sys.stdout.write(f"wrote {name}\n")
             if path.suffix == ".py" and root == ROOT:
-                # What follows is written from this module, which a new process loads.
+                # Later files are generated from this module; a new process loads it.
                 sys.stdout.flush()
                 os.execv(sys.executable, [sys.executable, __file__, *arguments])  # noqa: S606
     if is_check:

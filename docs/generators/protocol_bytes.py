@@ -1,6 +1,7 @@
-"""The bytes on docs/reference/{protocol,serial,modbus,can}.md, by the codecs of both ends.
+"""The example bytes on docs/reference/{protocol,serial,modbus,can}.md.
 
-One set and its commit, then other requests, each by a host's wire and a simulated amplifier.
+They show a set with its commit, and other requests, exchanged between the host's code for a wire
+and a simulated amplifier.
 """
 
 import textwrap
@@ -24,18 +25,18 @@ from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 SESSION, TOKEN = 0x2A17, 0x0102
 _NOW = 7.5
-"""Time [s] of all that is shown: three eighths of a turn of the clock."""
+"""Time [s] of all examples: three eighths of a turn of the clock."""
 _BYTES_PER_LINE = 32
 
-# What protocol.md says in words: frequency, then level and phase of each channel.
+# The example of protocol.md: frequency, then level and phase of each channel.
 _TONES = (
     (110.0, ((0.2, 0.0), (0.11, -90.0))),
     (240.0, ((0.25, 0.0), (0.12, -10.0))),
 )
 _BEFORE = ((0, 110.0, (0.22, 0.1)), (2, 150.0, (0.04, 0.2)), (3, 190.0, (0.07, 0.02)))
-"""Layers before: number, frequency, levels."""
+"""Layers that already play: number, frequency, levels."""
 _ONSET = (0.005, ((0.1, 90.0), (0.3, -0.01)))
-"""Of the new tone on channel 0: step, knots."""
+"""Step and knots of the new tone on channel 0."""
 
 
 def _integer(name: str, value: float) -> int:
@@ -43,7 +44,7 @@ def _integer(name: str, value: float) -> int:
 
 
 def _wire_set(layers: Sequence[AmplifierLayer]) -> list[LayerSet]:
-    """Return layers in units of the wire."""
+    """Return layers in integers of the wire."""
 
     def command(tone: AmplifierTone) -> Command:
         level, phase = _integer("level", tone.level), _integer("phase", tone.phase)
@@ -60,7 +61,7 @@ def _wire_set(layers: Sequence[AmplifierLayer]) -> list[LayerSet]:
 
 
 def _joined() -> list[LayerSet]:
-    """Return the set: layer 0 changes, 1 begins with an onset, 2 is silenced, 3 prolonged."""
+    """Return a set: layer 0 changes, 1 starts with an onset, 2 is silenced, 3 is renewed."""
     changed, begun = _wire_set(
         [
             AmplifierLayer(
@@ -85,7 +86,7 @@ def _joined() -> list[LayerSet]:
 
 
 def _parts() -> list[tuple[Values, Sequence[LayerSet]]]:
-    """Return the parts of the set, each with its layers: cut behind the first one."""
+    """Return the parts of the set with their layers; the first part has one layer."""
     first, *others = _joined()
     head = {"session": SESSION, "token": TOKEN, "parts": 2, "now": 0}
     return [
@@ -101,7 +102,7 @@ _STOP = {"ramp": 5}
 
 
 class _Exchange:
-    """A host's wire and a simulated amplifier of four channels, at one moment; notes all bytes.
+    """A host's wire and a simulated amplifier with four channels, at a fixed time; logs all bytes.
 
     kind: serial, tcp, rtu or can; number: sequence, tag or number of the last request.
     """
@@ -125,7 +126,7 @@ class _Exchange:
             self._end = ModbusAmplifiers(far, self._replied, is_rtu=is_rtu)
 
     def request(self, name: str, values: Values, address: int = 1) -> list[str]:
-        """Send a request; return what went over the line, a line for each frame."""
+        """Send a request; return the frames in both directions, a line for each."""
         self._lines = []
         has_reply = address > 0 and (name != "Set" or is_last(values))
         self._send(self._wire.request(address, name, values, has_reply=has_reply))
@@ -146,14 +147,14 @@ class _Exchange:
         for identifier, content in frames:
             self._lines.append(f"{direction} {identifier:03X} {content.hex(' ').upper()}")
         while data and not self._is_can:
-            # Over TCP several may go out together: each says how many bytes follow the sixth.
+            # TCP can join messages; a message contains the number of bytes after its sixth.
             size = 6 + int.from_bytes(data[4:6], "big") if self._is_tcp else len(data)
             self._lines.append(f"{direction} {data[:size].hex(' ').upper()}")
             data = data[size:]
 
 
 def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
-    """Return an exchange with an armed amplifier and three layers, after requests by name."""
+    """Return an exchange with an armed amplifier that plays three layers, after requests."""
     exchange = _Exchange(kind, number)
     exchange.amplifier.handle("Arm", _ARM, _NOW)
     layers = [
@@ -172,7 +173,7 @@ def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
 
 
 def _block(shown: Mapping[str, Sequence[str]]) -> str:
-    """Return requests by their titles, each with its frames, as a block of code."""
+    """Return the frames of requests, below their titles, as a code block."""
     lines = list[str]()
     for title, frames in shown.items():
         lines.append(f"# {title}")
@@ -185,7 +186,7 @@ _KINDS: Mapping[str, str] = {"serial": "serial", "modbus": "tcp", "can": "can"}
 _FIRST: Mapping[str, tuple[int, str]] = {
     **{"serial": (7, ""), "modbus": (65533, "GetCaps"), "can": (6, "Hello")}
 }
-"""Number before the set, and the request of which the page says nothing."""
+"""Last number before the set, and requests before it that the page omits."""
 
 
 def _join(page: str) -> str:
@@ -223,11 +224,11 @@ _MORE: Mapping[str, Sequence[str]] = {
         *(": an Event, then the reply", "", ": an Event, no reply"),
     ),
 }
-"""What is to be seen of Hello, Arm, Ping and Stop on each wire."""
+"""Remarks about Hello, Arm, Ping and Stop on each wire."""
 
 
 def _more(page: str) -> str:
-    """Return requests to an amplifier that is disarmed at first."""
+    """Return requests to an initially disarmed amplifier."""
     requests: Sequence[tuple[str, str, Values, int]] = (
         ("Hello", "Hello", {}, 1),
         (f"Arm with session {SESSION:04X}, watchdog 250 ms", "Arm", _ARM, 1),
@@ -252,7 +253,7 @@ _READINGS: Sequence[tuple[str, Values]] = (
     ("GetFaults", {}),
     ("GetAchieved", {"layer": 0}),
 )
-"""Requests that an amplifier answers before it can be armed."""
+"""Requests that an amplifier answers before it is armed."""
 
 
 def _readings() -> str:
@@ -275,14 +276,14 @@ _REPLY_NAMES = {
 
 
 def _words(rows: Iterable[tuple[Sequence[int], str]]) -> str:
-    """Return rows of words with what stands beside them, as a block of code."""
+    """Return rows of words with their explanations, as a code block."""
     shown = [(" ".join(f"{word % 0x10000:04X}" for word in words), text) for words, text in rows]
     width = max(len(words) for words, _ in shown)
     return "\n".join(f"    {words:{width}}   {text}" for words, text in shown)
 
 
 def _stream(layers: Iterable[LayerSet]) -> Iterator[tuple[Sequence[int], str]]:
-    """Yield the words of a stream with their meaning: of each layer, command and envelope."""
+    """Yield the words of a stream with their meaning, by layer, command and envelope."""
     for layer in layers:
         stream = pack_layers([layer])
         head, at = stream[:3], 3
@@ -334,7 +335,7 @@ def _phase(phase: int) -> str:
 
 
 def _fields(record: Record, values: Values) -> Iterator[tuple[Sequence[int], str]]:
-    """Yield the words of a record with the names of its fields; numbers with their values."""
+    """Yield the words of a record with the names of its fields, and the values of numbers."""
     words, at = record.pack(values), 0
     for field in record.fields:
         match field:
@@ -361,7 +362,7 @@ def _fields(record: Record, values: Values) -> Iterator[tuple[Sequence[int], str
 
 
 def _in_lines(rows: Iterable[tuple[Sequence[int], str]]) -> Iterator[tuple[Sequence[int], str]]:
-    """Yield rows of one word in lines of four."""
+    """Join rows of a single word to lines of four words."""
     words, texts = list[int](), list[str]()
     for more, text in rows:
         if words and (len(words) == 4 or len(more) > 1):
@@ -376,7 +377,7 @@ def _in_lines(rows: Iterable[tuple[Sequence[int], str]]) -> Iterator[tuple[Seque
 
 
 def _join_words() -> str:
-    """Return the words of the set, of its reply, of the commit and of the reply to that."""
+    """Return the words of the set, its commit, and both replies."""
     handle = _vibrating("serial", 7).amplifier.handle
     rows = list[tuple[Sequence[int], str]]()
     for part, layers in _PARTS:
@@ -408,4 +409,4 @@ BYTES: Mapping[str, Mapping[str, Callable[[], str]]] = {
     "modbus": {**{"join": partial(_join, "modbus"), "more": partial(_more, "modbus"), "rtu": _rtu}},
     "can": {"join": partial(_join, "can"), "more": partial(_more, "can")},
 }
-"""What writes each block of bytes, by page and part."""
+"""Writers of the blocks of bytes, by page and part."""

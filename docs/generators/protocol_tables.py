@@ -69,7 +69,7 @@ _MEANINGS = {
     **{"BAD_TOKEN": "0, not newer, or not staged"},
     **{"BUSY": "the host repeats the request after 5 ms, at most twice"},
     **{"UNSUPPORTED_VERSION": "version of the frame, on serial lines only"},
-    **{"WRONG_SESSION": "session of another host, or one that has ended"},
+    **{"WRONG_SESSION": "session of another host, or an ended session"},
     **{"WRONG_LATCH": "Clear does not specify the last stop or fault"},
     **{"INCOMPLETE": "Commit of a set with missing parts"},
     **{"output": "full level is the output of a linear amplifier, not the amplitude of a motion"},
@@ -105,7 +105,7 @@ _CAPABILITY_MEANINGS = {
     "knots": "maximum number of knots in an envelope",
     "features": "bits, listed above",
     "frequency_min, frequency_max, level_max": "limits of the whole amplifier, "
-    "at least as wide as those of its channels",
+    "at least as wide as the limits of its channels",
     "frequency_step, level_step, phase_step": "resolution of playback",
     "ramp_max": "longest ramp",
     "slew": "fastest change of amplitude. A steeper change is played at this slope and arrives "
@@ -126,7 +126,7 @@ _STATUS_MEANINGS = {
     "high_voltage": "measured, so it falls gradually; 0 if it cannot be",
     "clock": "see [the clock](#the-clock)",
     "token": "token of the last set committed since Arm; 0: none",
-    "channels, layers": "as in Capabilities",
+    "channels, layers": "see Capabilities",
     "levels": "level of each channel (below) at `clock`, or up to 0.2 ms earlier",
     "tokens": "token of the set that each layer plays; 0: the layer is over",
 }
@@ -141,7 +141,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _side_by_side(head: Sequence[str], rows: Sequence[Sequence[object]], parts: int) -> str:
-    """Return a table in parts that stand beside each other."""
+    """Return a table split into parts that are placed side by side."""
     height = -(-len(rows) // parts)
     filled = [*rows, *[("",) * len(head)] * (height * parts - len(rows))]
     columns = (filled[height * part : height * (part + 1)] for part in range(parts))
@@ -149,7 +149,7 @@ def _side_by_side(head: Sequence[str], rows: Sequence[Sequence[object]], parts: 
 
 
 def quantities() -> str:
-    """Return the steps and ranges, a row for all quantities that have the same."""
+    """Return the steps and ranges; quantities with equal values share a row."""
     groups: dict[tuple[object, ...], list[str]] = {}
     for each in QUANTITIES.values():
         row = f"{each.minimum} to {each.maximum}", each.scale
@@ -159,7 +159,7 @@ def quantities() -> str:
 
 
 def heads() -> str:
-    """Return the bits of words that are shared, as a picture: a letter for each bit."""
+    """Return a picture of the shared words with a letter for each bit."""
     shared = {"Set": MESSAGES["Set"].request, "layer": LAYER, "command": COMMAND}
     shared |= {"Taken": MESSAGES["Set"].reply, "Status": STATUS}
     lines = ["bit      " + " ".join(f"{bit:2}" for bit in range(15, -1, -1))]
@@ -174,7 +174,7 @@ def heads() -> str:
 
 
 def messages() -> str:
-    """Return the messages with the words of their requests."""
+    """Return the table of messages with the words of their requests."""
 
     def rows() -> Iterator[Sequence[object]]:
         yield "Hello", HELLO, _PURPOSES["Hello"], "–", "Identity", "", ""
@@ -189,13 +189,13 @@ def messages() -> str:
 
 
 def records() -> str:
-    """Return the words of replies and of the parts of a set."""
+    """Return the words of replies, and of the parts of a set."""
     rows = ((name, layout(record)) for name, record in {**_OTHERS, **_REPLIES}.items())
     return _table(("record", "words"), rows)
 
 
 def fields(record: Record, meanings: Mapping[str, str]) -> str:
-    """Return the fields of a record with their meanings; raises ValueError if one has none."""
+    """Return the fields of a record with their meanings; raises ValueError if one is missing."""
     explained = [name for names in meanings for name in names.split(", ")]
     names = list[str]()
     for field in record.fields:
@@ -210,7 +210,7 @@ def fields(record: Record, meanings: Mapping[str, str]) -> str:
 
 
 def _status_meanings() -> Mapping[str, str]:
-    """Return the meanings of the fields of Status; of a later reading, its own."""
+    """Return the meanings of the fields of Status, including readings that were added later."""
     meanings = dict(_STATUS_MEANINGS)
     for reading in READINGS:
         meanings.setdefault(reading.name, f"{reading.meaning}; 0: not stated")
@@ -218,7 +218,7 @@ def _status_meanings() -> Mapping[str, str]:
 
 
 def readings() -> str:
-    """Return the readings of Status, and where they are shown."""
+    """Return the readings of Status, and the places that show them."""
     rows = (
         (
             *(each.name, f"`{each.key}`", f"`era_amplifier_{each.metric}`"),
@@ -231,7 +231,7 @@ def readings() -> str:
 
 
 def layout(record: Record) -> str:
-    """Return the words of a record in their order, each field with its quantity or bits."""
+    """Return the words of a record in order, with the quantity or bits of each field."""
     return " · ".join(map(_field, record.fields))
 
 
@@ -273,7 +273,7 @@ def transitions() -> str:
 
 
 def _list(title: str, named: Mapping[str, int]) -> str:
-    """Return names and numbers as a sentence, with meanings where the name is not enough."""
+    """Return names and numbers as a sentence, with meanings unless the name is enough."""
     listed = (
         f"{name} {number}" + (f" ({_MEANINGS[name]})" if _MEANINGS[name] else "")
         for name, number in named.items()
@@ -298,7 +298,7 @@ def emergencies() -> str:
 
 
 def objects() -> str:
-    """Return the words of the objects 2001 and 2002 of four channels and eight layers."""
+    """Return the words of objects 2001 and 2002, for four channels and eight layers."""
 
     def rows() -> Iterator[Sequence[object]]:
         for index, name in (("2001", "GetCaps"), ("2002", "GetStatus")):
@@ -332,4 +332,4 @@ TABLES: Mapping[str, Mapping[str, Callable[[], str]]] = {
     "modbus": {"mailboxes": mailboxes},
     "can": {"emergencies": emergencies, "objects": objects},
 }
-"""What writes each table, by page and part."""
+"""Writers of the tables, by page and part."""

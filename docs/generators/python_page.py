@@ -2,9 +2,9 @@
 
 Each block is between `<!-- end -->` and a comment that lists its names: `<!-- begin: api: query;
 Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and a
-class that other code creates, with all of its members. Functions form a list. A class has a
-heading and a list of its members, documented fields first. `Example:` at the end of a docstring is
-a session, which tests/docs/test_pages.py types.
+class that other code creates, with all its members. Functions form a list. A class has a heading
+and a list of its members, documented fields first. An `Example:` at the end of a docstring is an
+interactive session, which tests/docs/test_pages.py runs.
 """
 
 import ast
@@ -24,31 +24,31 @@ Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def with_entries(page: str) -> str:
-    """The page with every block as its comment and the source have it."""
+    """Return the page with all blocks regenerated."""
     return _BLOCK.sub(lambda block: block[1] + _public("\n".join(_entries(block[2]))) + "\n", page)
 
 
 def _public(text: str) -> str:
-    """A text with the public name of every class that has another one where it is defined."""
+    """Replace internal class names in a text by the names in the API."""
     for name, (_, own) in era_haptics._HOMES.items():
         text = text if name == own else re.sub(rf"\b{own}\b", name, text)
     return text
 
 
 def named(page: str) -> set[str]:
-    """The names that the page has entries for."""
+    """Return the names with an entry on the page."""
     entries = ";".join(block[2] for block in _BLOCK.finditer(page)).split(";")
     return {entry.partition(":")[0].strip(" ()") for entry in entries}
 
 
 def _entries(names: str) -> Iterator[str]:
-    """The lines of a block."""
+    """Yield the lines of a block."""
     is_list = True
     for place, entry in enumerate(names.split(";")):
         name, _, members = entry.strip().partition(":")
         tree = _tree(getattr(era_haptics, name.strip("()")))
         if isinstance(tree, ast.ClassDef):
-            tree.name = name.strip("()")  # that of the API, whatever it is called in its module
+            tree.name = name.strip("()")  # the name in the API, which can differ
             yield from [""] if place else []
             yield from _class(tree, members.replace(",", " ").split(), name.endswith("()"))
         elif isinstance(tree, Function):
@@ -58,7 +58,7 @@ def _entries(names: str) -> Iterator[str]:
 
 
 def _tree(thing: Any) -> ast.stmt:
-    """The source of a function, or of a class with that of the coroutine functions it wraps."""
+    """Return the syntax tree of a function, or of a class with wrapped coroutine functions."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
     if isinstance(tree, ast.ClassDef):
         tree.body = [_unwrapped(thing, member) for member in tree.body]
@@ -77,7 +77,7 @@ def _class_body(kind: Any) -> list[ast.stmt]:
 
 
 def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:
-    """A member of a class; as a plain function, if it is one that wraps a coroutine function."""
+    """Return a member of a class; for a wrapper of a coroutine, the plain function."""
     if not isinstance(member, ast.Assign):
         return member
     wrapper = getattr(kind, ast.unparse(member.targets[0]))
@@ -88,7 +88,7 @@ def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:
 
 
 def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> Iterator[str]:
-    """A class with its fields; below its text those of its members that are named, `*` for all."""
+    """Yield a class with its fields, its text, and the named members (`*` for all)."""
     fields, listed, documented = [], [], []
     for member, below in pairwise([*tree.body, ast.Pass()]):
         if isinstance(member, ast.AnnAssign) and not ast.unparse(member.target).startswith("_"):
@@ -114,12 +114,12 @@ def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> I
 
 
 def _item(tree: Function) -> Iterator[str]:
-    """A function or a property as an item of a list."""
+    """Yield a function or property as a list item."""
     yield from _text(tree, f"- `{_signature(tree)}`: ", "  ")
 
 
 def _signature(tree: Function) -> str:
-    """A function or a property as it is used."""
+    """Return the signature of a function or property."""
     result = "" if tree.returns is None else f" -> {ast.unparse(tree.returns)}"
     decorators = {ast.unparse(each) for each in tree.decorator_list}
     if decorators & {"property", "cached_property"}:
@@ -130,9 +130,9 @@ def _signature(tree: Function) -> str:
 
 
 def _text(tree: ast.ClassDef | Function, start: str, indent: str) -> Iterator[str]:
-    """The docstring as one line, as on the other written pages, and the example below it.
+    """Yield the docstring as a single line, and its example below.
 
-    Items of a list are parts of a sentence.
+    Items of a list are joined to a sentence.
     """
     told, _, example = (ast.get_docstring(tree) or "").partition("\n\nExample:\n")
     told = re.sub(r"(?<=[^.])\n\n(?=[A-Z])", ". ", told)

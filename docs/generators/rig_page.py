@@ -29,7 +29,7 @@ SECTIONS: Mapping[str, type[Section]] = {
 
 
 def _own_losses() -> str:
-    """Default loss factors of materials that differ from the general default."""
+    """Return the default loss factors of materials that differ from the general default."""
     own = {name: each.own_loss for name, each in KNOWN_MATERIALS.items() if each.own_loss}
     by_loss = [
         f"{100 * loss:g} % ({', '.join(f'`{name}`' for name in own if own[name] == loss)})"
@@ -39,12 +39,12 @@ def _own_losses() -> str:
 
 
 def _types() -> str:
-    """Types of exciters, each with its note."""
+    """Return the types of exciters with their notes."""
     return "\n".join(f"- `{each.name}`: {each.note}" for each in EXCITER_TYPES.values())
 
 
 def _feet() -> str:
-    """Stiffness and loss factor of feet by their kind."""
+    """Return the stiffness and loss factor of each kind of foot."""
     feet = ", ".join(f"`{kind}` {stiffness / 1e3:g} kN/m" for kind, stiffness in FEET.items())
     return (
         f"Assumed values for feet of about 2 cm: stiffness of {feet}; loss factor {FOOT_LOSS:g}, "
@@ -53,7 +53,7 @@ def _feet() -> str:
 
 
 def _weather() -> str:
-    """Changes of moduli with temperature and moisture, by material."""
+    """Return the changes of moduli with temperature and moisture, by material."""
     rows = [
         f"| `{name}` | {100 * each.by_kelvin:g} % | "
         f"{f'{each.by_moisture:g} %' if each.by_moisture else '-'} | {each.weather} |"

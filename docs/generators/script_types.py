@@ -17,17 +17,17 @@ export type Event = {
   [T in Topic]: { topic: T; time_s: number; lost: number; data: Topics[T] };
 }[Topic];
 
-/** A method's parameters as arguments: they may be left out where all of them may. */
+/** A method's parameters as arguments, optional if all parameters are optional. */
 export type Arguments<M extends Method> = {} extends Methods[M]["params"]
   ? [params?: Methods[M]["params"]]
   : [params: Methods[M]["params"]];"""
 
 
 def messages() -> str:
-    """The whole file api.d.ts."""
+    """Return the file api.d.ts."""
     models: Models = {}
     methods = [
-        *_interface("Methods", "Every method by name: its parameters and its result."),
+        *_interface("Methods", "Parameters and result of every method."),
         *(
             f"  /** {summary} */\n  {name}: {{ params: {_TYPES.type_of(method.params, models)}; "
             f"result: {_TYPES.type_of(method.result, models)} }};"
@@ -50,7 +50,7 @@ def messages() -> str:
 
 
 def with_version(package: str) -> str:
-    """The file package.json with the version in pyproject.toml, installed or not."""
+    """Return package.json with the version in pyproject.toml."""
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     return re.sub(r'("version": )"[^"]*"', rf'\1"{project["version"]}"', package)
 

@@ -2,8 +2,8 @@
 
     python docs/generators/time_pictures.py docs/pictures
 
-Write transients.png and plant_touch.png for the founding paper's plate, and print the numbers of
-their captions. A minute.
+Writes transients.png and plant_touch.png for the founding paper's plate, and prints the numbers in
+their captions. Takes a minute.
 """
 
 import sys
@@ -43,7 +43,10 @@ RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
 
 TARGET, QUIET = (0.09, 0.08), (0.24, 0.14)  # m
 DRAWN = 0.16  # s
-ONSET, LATE = 0.1, 0.04  # s; window of an onset's contrast, start of an ending's rest
+ONSET, LATE = (
+    0.1,
+    0.04,
+)  # s; window of an onset, start of the rest after an ending
 TARGET_COLOR, QUIET_COLOR = "0.7", "#b2182b"
 
 
@@ -116,7 +119,7 @@ class _Fingers:
 def _fingers(
     rig: Rig, transients: Transients, bases: Bases, *, after: Excitation | None = None
 ) -> _Fingers:
-    """Simulate both fingertips; after: the excitation that was steady before, None for rest."""
+    """Simulate both fingertips; after: the steady excitation before, None for a plate at rest."""
     target_points = fingertip_points(*TARGET, rig.plate)
     quiet_points = fingertip_points(*QUIET, rig.plate)
     points = np.concatenate([target_points, quiet_points])
@@ -199,7 +202,7 @@ def _vibration(rig: Rig, contacts: Sequence[FingertipLoad]) -> tuple[FloatArray,
 
 
 def main() -> None:
-    """Draw both pictures into the folder."""
+    """Draw both pictures into a folder."""
     folder = Path(sys.argv[1])
     rig = load_rig(RIG)
     save_figure(transients_figure(rig), folder / "transients.png")

@@ -1,7 +1,8 @@
-"""URL schemes of amplifiers and wires of simulated ones, where they are listed.
+"""URL schemes of amplifiers, and wires of simulated amplifiers.
 
-Tables on pages, the help of `era amp`, and the table of classes in drivers/wires/wire.py, from
-`WireAddress.SCHEMES` of each class and from the simulation's table of far ends.
+They are listed in tables on pages, in the help of `era amp`, and in the table of classes in
+drivers/wires/wire.py. The sources are `WireAddress.SCHEMES` of each class, and the simulation's
+table of far ends.
 """
 
 import pkgutil
@@ -17,26 +18,24 @@ _SIMULATION = "sim.memory_line"
 
 
 def classes() -> str:
-    """The class of each scheme, in Python; simulated amplifiers last."""
+    """Return the class of each scheme as Python code, simulated amplifiers last."""
     places = {}
     for scheme, address, _ in _schemes():
         places[scheme] = f"{address.__module__}:{address.__name__}"
     lines = []
     for scheme in sorted(places, key=lambda scheme: (places[scheme].startswith("sim."), scheme)):
         if places[scheme].startswith("sim."):
-            lines.append(
-                "    # A plug-in of a package that imports this one; others never load it."
-            )
+            lines.append("    # In a package that imports this one; imported only if it is used.")
         lines.append(f'    "{scheme}": "{places[scheme]}",')
     body = "\n".join(lines)
     return (
         f"_CLASSES: Mapping[str, str] = {{\n{body}\n}}\n"
-        '"""The classes of the project\'s own schemes, loaded when they are used."""'
+        '"""Classes of the built-in schemes, imported when they are used."""'
     )
 
 
 def help_text() -> str:
-    """The list of URLs in the help of `era amp`, in Python."""
+    """Return the list of URLs in the help of `era amp`, as Python code."""
     rows = [scheme for _, _, scheme in _schemes()]
     width = max(len(scheme.example) for scheme in rows)
     lines = [f"  {scheme.example:{width}}  {scheme.help}" for scheme in rows]
@@ -48,7 +47,7 @@ def help_text() -> str:
 
 
 def urls() -> str:
-    """The table of URLs."""
+    """Return the table of URLs."""
     lines = ["| scheme and place | amplifier | options (default) |", "|---|---|---|"]
     for _, _, scheme in _schemes():
         for form, options in scheme.forms.items():
@@ -57,7 +56,7 @@ def urls() -> str:
 
 
 def far_ends() -> str:
-    """The table of wires that can be simulated."""
+    """Return the table of wires that can be simulated."""
     lines = ["| WIRE | the host opens |", "|---|---|"]
     for name, kind in FAR_ENDS.items():
         wire = f"{name}:PORT" if kind.is_ported else name
@@ -74,7 +73,7 @@ PARTS: Mapping[str, Callable[[], str]] = {
 
 
 def _schemes() -> Iterator[tuple[str, type[WireAddress], Scheme]]:
-    """Each scheme with its class and its facts: serial lines first, simulated amplifiers last."""
+    """Yield each scheme with its class: serial lines first, simulated amplifiers last."""
     for module in _modules():
         for address in vars(module).values():
             if not (isinstance(address, type) and issubclass(address, WireAddress)):
@@ -85,7 +84,7 @@ def _schemes() -> Iterator[tuple[str, type[WireAddress], Scheme]]:
 
 
 def _modules() -> list[ModuleType]:
-    """The modules with addresses; not by the registry, which is written from them."""
+    """Return the modules with addresses, found without the registry, which is generated."""
     names = sorted(
         (info.name for info in pkgutil.iter_modules(drivers.wires.__path__)), reverse=True
     )

@@ -1,4 +1,4 @@
-"""The wiring of a plate for a weekend as a picture, from computer to exciters and back."""
+"""Picture of the wiring of the weekend plate, from the computer to the exciters and back."""
 
 from collections.abc import Iterator, Sequence
 
@@ -6,7 +6,7 @@ Point = tuple[float, float]
 
 RED, BLACK, BLUE, GREEN, GREY = "#c62828", "#222222", "#1565c0", "#2e7d32", "#33475b"
 ROWS = {"NE": 92, "NW": 132, "SW": 172, "SE": 212}
-"""Height of each exciter's row at card and amplifier, in the order of their outputs."""
+"""Vertical position of each exciter's row, in the order of outputs."""
 BOARD = (700, 66, 200, 153)
 PLACES = {"NE": (868, 100), "NW": (754, 95), "SW": (736, 182), "SE": (858, 193)}
 WAYS: dict[str, Sequence[Point]] = {
@@ -19,7 +19,7 @@ TITLE = "Wiring: four outputs of a sound card through an amplifier to four excit
 
 
 def wiring() -> str:
-    """The picture as SVG."""
+    """Return the picture as SVG."""
     lines = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 960 392" font-family="sans-serif" '
         'font-size="13" role="img">',
@@ -34,7 +34,7 @@ def wiring() -> str:
 
 
 def _box(x: float, y: float, width: float, height: float, *text: str, fill: str = "#eef3f8") -> str:
-    """A box with lines of text at its top."""
+    """Return a box with lines of text at its top."""
     words = "".join(
         _text((x + width / 2, y + 18 + 15 * n), each, anchor="middle")
         for n, each in enumerate(text)
@@ -80,7 +80,7 @@ def _amplifier() -> Iterator[str]:
 
 
 def _beside(way: Sequence[Point]) -> list[Point]:
-    """The way of the second wire of a pair, 5 below or beside the first."""
+    """Return the path of the second wire of a pair, at a distance of 5 from the first."""
     return [(x + 5, y + 5) for x, y in way[:-1]] + [
         (way[-1][0] + 5 * (way[-1][0] == way[-2][0]), way[-1][1] + 5 * (way[-1][1] == way[-2][1]))
     ]
@@ -101,7 +101,7 @@ def _board() -> Iterator[str]:
 def _sensor_and_loop() -> Iterator[str]:
     yield _box(778, 121, 14, 14, fill="#c8e6c9")
     cable = [(360, 288), (440, 288), (440, 306), (670, 306), (670, 128), (778, 128)]
-    yield _line(cable, GREEN, dashes="7 4")  # told from red wires without colors
+    yield _line(cable, GREEN, dashes="7 4")  # distinguishable from red wires without color
     yield _text((676, 300), "accelerometer and its supply: move it", color=GREEN)
     yield _text((676, 316), "to each position, arrow upwards", color=GREEN)
     yield _line([(400, 212), (400, 324), (360, 324)], BLUE)

@@ -1,4 +1,4 @@
-"""Names of the words of a message, for pages and files that list them one by one."""
+"""Names of the words of a message, for pages and files that list every word."""
 
 from collections.abc import Iterator, Mapping
 
@@ -6,7 +6,7 @@ from drivers.protocol.records import Bits, Number, Numbers, Record, Rows
 
 
 def word_names(record: Record, counts: Mapping[str, int]) -> list[str]:
-    """Return the names of the words of a record; counts: how many rows, by what counts them."""
+    """Return the names of the words of a record; counts: number of rows by count field."""
     return [*_names(record, counts)]
 
 

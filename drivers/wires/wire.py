@@ -328,10 +328,10 @@ _CLASSES: Mapping[str, str] = {
     "modbus+tcp": "drivers.wires.modbus:ModbusAddress",
     "serial": "drivers.wires.serial_line:SerialAddress",
     "serial+tcp": "drivers.wires.serial_line:SerialAddress",
-    # A plug-in of a package that imports this one; others never load it.
+    # In a package that imports this one; imported only if it is used.
     "sim": "sim.memory_line:SimulatedAddress",
 }
-"""The classes of the project's own schemes, loaded when they are used."""
+"""Classes of the built-in schemes, imported when they are used."""
 
 # end
 

@@ -1,6 +1,6 @@
 // Written by docs/generators/script_types.py.
 
-/** Every method by name: its parameters and its result. */
+/** Parameters and result of every method. */
 export interface Methods {
   /** Introduce the client; returns the daemon's rig, table and layout. */
   hello: { params: HelloParams; result: HelloResult };
@@ -67,7 +67,7 @@ export type Event = {
   [T in Topic]: { topic: T; time_s: number; lost: number; data: Topics[T] };
 }[Topic];
 
-/** A method's parameters as arguments: they may be left out where all of them may. */
+/** A method's parameters as arguments, optional if all parameters are optional. */
 export type Arguments<M extends Method> = {} extends Methods[M]["params"]
   ? [params?: Methods[M]["params"]]
   : [params: Methods[M]["params"]];

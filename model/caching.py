@@ -1,4 +1,4 @@
-"""The cache folder of tables, and the versions that results carry."""
+"""Cache folder of tables, and the versions that results contain."""
 
 import hashlib
 from functools import cache
@@ -9,7 +9,7 @@ import platformdirs
 
 
 def cache_folder() -> Path:
-    """Path of the user's cache folder; raises FileNotFoundError for a user without a home."""
+    """Return the user's cache folder; raises FileNotFoundError without a home folder."""
     try:
         folder = platformdirs.user_cache_path("era-haptics", appauthor=False)
     except RuntimeError:  # neither HOME nor an entry in passwd
@@ -22,16 +22,16 @@ def cache_folder() -> Path:
 
 
 NUMERICS_VERSION = 23
-"""Version of the numbers that the model computes: kept results of another one are not reused.
+"""Version of the numbers that the model computes; stored results of other versions are not used.
 
-Increase it with every change of figures beyond rounding, then record the new figures by
+Increase it with every change of figures beyond rounding. Then record the new figures with
 `python tests/support/reference_figures.py`.
 """
 
 
 @cache
 def code_version() -> str:
-    """The version of the distribution and the start of a SHA-256 over the source of the model."""
+    """Return the version of the distribution and the start of the SHA-256 of the model's source."""
     digest = hashlib.sha256()
     pending = [resources.files("model")]
     while pending:

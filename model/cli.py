@@ -1,4 +1,4 @@
-"""The model's share of the `era` command."""
+"""Commands of the model for the command `era`."""
 
 import typer
 

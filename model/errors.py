@@ -21,7 +21,7 @@ _MAX_LENGTH = 40
 
 
 def expect_instance(value: object, cls: type, *, what: str, made_by: str) -> None:
-    """Raise InputError for a value of another class; made_by: code that makes one."""
+    """Raise InputError for a value of another class; made_by: code that makes an instance."""
     if not isinstance(value, cls):
         raise InputError(
             f"{what} must be a {cls.__name__}, got {shown(value)}; make one with {made_by}"
@@ -61,7 +61,7 @@ def expect_values(
 
 
 def is_whole(value: object) -> bool:
-    """Return whether a value is a whole number, of Python or numpy."""
+    """Return whether a value is an integer of Python or numpy."""
     return isinstance(value, Integral)
 
 

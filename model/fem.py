@@ -1,13 +1,13 @@
 """Finite-element model of the plate: mesh, matrices, and natural modes.
 
-A structured mesh over the plate of Reissner-Mindlin rectangles: MITC4, the paper's, Q3 to Q5.
+The mesh is a lattice of Reissner-Mindlin rectangles: MITC4 (the founding paper's) or Q3 to Q5.
 
-Every function of the mesh is the product of one of x and one of y, and so is every integral over
-the plate (`ElementRow`). From the third order on, on Gauss-Lobatto nodes, thin plates do not lock.
-The four-node element would: its shear strain along x is assumed constant along x, that along y
-constant along y (Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383), which on a
-rectangle takes rotations by their mean along the strain. Narrow elements at a free edge resolve the
-boundary layer, as wide as the plate is thick, that limits elements of low order to linear
+A function of the mesh is the product of a function of x and a function of y, and so is an integral
+over the plate (`ElementRow`). Thin plates do not lock with elements of the third order and above on
+Gauss-Lobatto nodes. The four-node element needs assumed shear strains: along x constant in x, along
+y constant in y (Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383). On a rectangle, this
+replaces a rotation by its mean along the strain. Narrow elements at a free edge resolve the
+boundary layer, which is as wide as the plate is thick and limits elements of low order to linear
 convergence (Babuška and Li, Comput. Methods Appl. Mech. Engrg. 100 (1992) 249-273; Häggblad and
 Bathe, Int. J. Num. Meth. Eng. 30 (1990) 981-1011).
 """
@@ -158,8 +158,8 @@ MIN_NODES_PER_WAVELENGTH = 6
 class Mesh(Discretization):
     """nx by ny equal rectangles over length by width [m], optionally with strips along the edges.
 
-    strip [m]: width of one more row of elements along every edge, for the boundary layer of a free
-    edge; the nx by ny elements then share the rest. The nodes form a lattice: node j * columns + i
+    strip [m]: width of an additional row of elements along every edge, for the boundary layer of a
+    free edge; the nx by ny elements share the rest. The nodes form a lattice: node j * columns + i
     is the i-th along x and the j-th along y.
     """
 
@@ -198,18 +198,18 @@ class Mesh(Discretization):
 
     @property
     def element_size(self) -> tuple[float, float]:
-        """Largest side lengths (dx, dy) of its elements [m], strips included."""
+        """Largest side lengths (dx, dy) of the elements [m], strips included."""
         dx = (self.length - 2 * self.strip) / self.nx
         dy = (self.width - 2 * self.strip) / self.ny
         return max(dx, self.strip), max(dy, self.strip)
 
     @cached_property
     def along(self) -> tuple[ElementRow, ElementRow]:
-        """Its elements along x and along y."""
+        """Elements along x and along y."""
         return self._row(self.length, self.nx), self._row(self.width, self.ny)
 
     def _row(self, side: float, count: int) -> ElementRow:
-        """Return the elements along a side [m]: strips, and a number of others between them."""
+        """Return the elements along a side [m]: `count` elements between the strips."""
         ends = np.linspace(self.strip, side - self.strip, count + 1)
         if self.strip:
             ends = np.concatenate([[0.0], ends, [side]])
@@ -246,7 +246,7 @@ class Mesh(Discretization):
 
     @property
     def element_name(self) -> str:
-        """Name of its element."""
+        """Name of the element."""
         return self.element.name
 
     @property
@@ -256,14 +256,14 @@ class Mesh(Discretization):
 
     @property
     def shortest_wavelength(self) -> float:
-        """The shortest bending wavelength [m] that it resolves: six elements of the first order."""
+        """Shortest resolved bending wavelength [m]: six elements of the first order."""
         return MIN_NODES_PER_WAVELENGTH * max(self.element_size) / self.element.order
 
     def resolving(self, plate: Plate, frequency: float) -> Self:
-        """The coarsest of its element, without strips, that resolves a frequency [Hz]."""
+        """Return the coarsest mesh of the element, without strips, for a frequency [Hz]."""
         order = self.element.order
         size = plate.bending_wavelength(frequency) * order / MIN_NODES_PER_WAVELENGTH
-        # Rounding must not turn a mesh that fits exactly into one too coarse.
+        # Rounding must not make an exactly fitting mesh too coarse.
         size *= 1 - 1e-9
         nx = math.ceil(plate.length / size)
         ny = math.ceil(plate.width / size)
@@ -341,7 +341,7 @@ def rigidities(plate: Plate) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class PlateMatrices:
-    """Stiffness and mass of the free plate, CSC, (dof, dof), with its mesh.
+    """Sparse stiffness and mass of the free plate (dof, dof), CSC, with their mesh.
 
     Degree of freedom 3 * node is the deflection, the next two are the rotations.
     """
@@ -352,7 +352,7 @@ class PlateMatrices:
     mass: sparse.csc_array
 
     def deflection_at(self, points: FloatArray) -> sparse.csr_array:
-        """Map of the degrees of freedom to deflections at points [m] (n, 2), sparse (n, dof)."""
+        """Return the sparse map (n, dof) of degrees of freedom to deflections at points (n, 2)."""
         deflection = sparse.csr_array(np.array([[1.0, 0.0, 0.0]]))
         interpolation = self.mesh.interpolation(points)
         return sparse.csr_array(sparse.kron(interpolation, deflection, format="csr"))
@@ -392,10 +392,11 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
 def _stiffness(
     mesh: Mesh, section: Mapping[str, float], by_side: str | None = None
 ) -> sparse.csc_array:
-    """Stiffness (dof, dof) of a section's rigidities; or its derivative by one side, "x" or "y".
+    """Return the stiffness (dof, dof) for a section's rigidities, or its derivative by a side.
 
-    By the logarithm of the side at the same mass, where functions are stretched with it and the
-    rotations along it times its reciprocal s, as slopes are: each part is a power of s.
+    The derivative is with respect to the logarithm of the side "x" or "y", at constant mass.
+    Functions are stretched with the side. Slopes and rotations along it are proportional to its
+    reciprocal s, so each part is proportional to a power of s.
     """
     along_x, along_y = mesh.along
     blocks: dict[str, Any] = {}
@@ -496,10 +497,10 @@ def factorize(matrix: sparse.sparray) -> SuperLU:
 
 
 def element_slopes(plate: Plate, mesh: Mesh, shapes: FloatArray) -> FloatArray:
-    """Derivatives of the stiffness between shapes (dof, r) of a plate on a mesh, (3, r, r).
+    """Return derivatives (3, r, r) of the stiffness between shapes (dof, r) of a plate on a mesh.
 
-    By the logarithms of length and width, at the same mass, and by Poisson's ratio: exactly, for
-    the reasons of `model.spectral.direct_solution`.
+    With respect to the logarithms of length and width, at constant mass, and to Poisson's ratio.
+    They are exact, as explained in `model.spectral.direct_solution`.
     """
     material = plate.material
     section = rigidities(plate)

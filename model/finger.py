@@ -3,16 +3,16 @@
 A fingertip is a disc, sampled at points with weights for the mean of a field. The cubature has
 rings about the center, at Gauss-Lobatto points of the radius squared, with evenly spaced points
 (product rules: Stroud, Approximate Calculation of Multiple Integrals, 1971, section 2.6). The
-outermost ring is the rim, so the largest value over the points is close to that over the disc.
-Where an edge of the plate cuts the disc, the mean is over the part that remains.
+outermost ring is the rim, so the largest value over the points is close to the maximum over the
+disc. If an edge of the plate cuts the disc, the mean is over the remaining part.
 
-A set of detection thresholds is a file in model/data/thresholds with its sources; its name is the
-file's. Measured thresholds differ by tens of decibels between ways to touch
+A set of detection thresholds is a file in model/data/thresholds with its sources; the file's name
+is the name of the set. Measured thresholds differ by tens of decibels between ways to touch
 (docs/concepts/people.md).
 
-Skin feels vibration up to about 1 kHz, by Pacinian corpuscles. Above that an onset has the ringing
-of the fingertip's contact mass on the plate and of modes far beyond the drive, on which models with
-different numbers of modes disagree; `felt_part` removes it.
+Pacinian corpuscles in the skin feel vibration up to about 1 kHz. At higher frequencies, an onset
+contains ringing of the fingertip's contact mass and of modes far above the drive. Models with
+different numbers of modes disagree about this ringing; `felt_part` removes it.
 """
 
 import csv
@@ -45,7 +45,7 @@ class DiscRule:
         """Return points (k, p, 2) and weights (..., k, p) for the disc's parts in k rectangles.
 
         low, high (k, 2): corners of the rectangles, in radii from the disc's center, which they
-        contain. Points outside move to the nearest place inside and get weight 0; the weights of
+        contain. Points outside move to the nearest point inside and get weight 0; the weights of
         the others make the mean of linear functions exact.
         """
         weights = self.weights[..., None, :].repeat(len(low), axis=-2)
@@ -146,8 +146,8 @@ def fingertips_on(
 ) -> tuple[FloatArray, FloatArray]:
     """Return points (k, p, 2) [m] under fingertips centered at (k, 2) [m], and weights (..., k, p).
 
-    The weighted sum over a fingertip's points is the mean over its disc, or over the part of it
-    that is on the plate. All points are on the plate and under the fingertip.
+    The weighted sum over a fingertip's points is the mean over its disc, or over the part of the
+    disc on the plate. All points are on the plate and under the fingertip.
     """
     low = -centers / FINGERTIP_RADIUS
     high = ([length, width] - centers) / FINGERTIP_RADIUS
@@ -286,7 +286,7 @@ def sensation_level(
 ) -> FloatArray:
     """Return the level [dB SL] of tones felt together: 20 log10 sqrt(sum (a_f / T(f))²).
 
-    frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf where nothing moves. Raises InputError
+    frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf for zero amplitude. Raises InputError
     for frequencies without data.
     """
     thresholds = detection_threshold(frequencies, threshold)
@@ -331,8 +331,8 @@ def contrast_db(
 ) -> FloatArray:
     """Return the contrast (...) [dB] of peak amplitudes: weakest target to loudest quiet point.
 
-    targets: amplitudes (..., p) of each, which counts by the mean with its weights (p,); quiet:
-    amplitudes (..., q) at quiet points.
+    targets: amplitudes (..., p) at the points of each target, whose mean with weights (p,) counts;
+    quiet: amplitudes (..., q) at quiet points.
     """
     means = [target @ weight for target, weight in zip(targets, weights, strict=True)]
     return decibels(np.minimum.reduce(means) / quiet.max(axis=-1))

@@ -33,7 +33,7 @@ def on_processes(
     shared: Shared,
     tasks: Mapping[int, Task],
 ) -> Iterator[tuple[int, _Result]]:
-    """Yield numbers of tasks with their results in the order in which they are done.
+    """Yield the numbers and results of tasks, in the order in which they finish.
 
     count: number of processes, 1 for this one; solve: a module-level function; shared: its first
     argument, sent to each process once. The processes end immediately if the caller stops early,
@@ -65,7 +65,7 @@ def on_processes(
         ) from None
     finally:
         if not is_done:
-            stopper.send_bytes(b"stop")  # read by none, so that all see it
+            stopper.send_bytes(b"stop")  # not read by any process, so that all receive it
         pool.shutdown(wait=True, cancel_futures=True)
         stopper.close()
         stop.close()
@@ -88,7 +88,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _start_worker(solve: Callable[[Any, Any], Any], shared: Any, stop: Connection) -> None:
-    """Keep what all tasks need; ignore Ctrl-C, which the parent process handles; end with it."""
+    """Store the data of all tasks; ignore Ctrl-C, which the parent handles; end with the parent."""
     global _in_worker
     _in_worker = solve, shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -142,7 +142,7 @@ def on_cluster(
     shared: Shared,
     tasks: Mapping[int, Task],
 ) -> Iterator[tuple[int, _Result]]:
-    """Yield numbers of tasks with their results in the order in which they are done.
+    """Yield the numbers and results of tasks, in the order in which they finish.
 
     address: of a scheduler, for example tcp://192.168.1.5:8786; solve: a function of a module;
     shared: its first argument. A task whose worker is lost is solved again. Raises InputError if

@@ -9,7 +9,7 @@ _ROUNDING = 1e-9  # of a percentage: 100 * 0.29 is 28.999999999999996
 
 
 def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
-    """Format a value of an SI unit, or of none, in the unit usual for plates: `17 kN/m`."""
+    """Format a value in an SI unit, or without unit, in the usual unit for plates: `17 kN/m`."""
     factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
     text = f"{value * factor:.{digits}g}"
     if "e+" in text:  # a plate of a meter is 1000 mm
@@ -51,12 +51,12 @@ def percent(share: float) -> str:
 
 
 def percent_down(share: float) -> str:
-    """Format a share as `79 %`, rounded down, so that a share below a limit never reads as it."""
+    """Format a share as `79 %`, rounded down, so that a share below a limit never looks equal."""
     return f"{math.floor(100 * share + _ROUNDING)} %"
 
 
 def counted(number: int, thing: str, *, plural: str | None = None) -> str:
-    """Format a number with its noun; plural: if it is not the noun with an s."""
+    """Format a number with its noun; plural: for nouns with an irregular plural."""
     if number == 1:
         return f"1 {thing}"
     return f"{number} {plural or f'{thing}s'}"

@@ -1,15 +1,15 @@
 """Steady vibration of a rig's plate: excitations, maps, natural modes and discretization errors.
 
 An excitation is a tone for each active ERA. ERAs at the same frequency add as complex numbers;
-between different frequencies magnitudes add (paper Eq. 28). Magnitudes added within a frequency
-would wipe out the nodal lines.
+at different frequencies magnitudes add (paper Eq. 28). Adding magnitudes at a single frequency
+would remove the nodal lines.
 
-Discretization errors are changes against a finer mesh (`study_convergence`). Where there is none,
-they are estimated (`estimate_error`). For polynomials over the plate the estimate is the sum of two
-changes of the response: by two further degrees, and by a compliance under forces that polynomials
-do not resolve which is higher by 20 % and, under points, by a decade of the logarithm
-(`model.spectral.modes`). For finite elements it is the change to polynomials, which are solved in
-at most a tenth of the time of elements as accurate (`reference_mesh`).
+Discretization errors are the changes on a finer mesh (`study_convergence`), or estimates
+(`estimate_error`). For polynomials over the plate, the estimate is the sum of two changes of the
+response: the change with two additional degrees, and the change if the compliance under forces that
+polynomials do not resolve is higher by 20 % (under points, by a decade of the logarithm;
+`model.spectral.modes`). For finite elements, the estimate is the difference to polynomials, which
+take at most a tenth of the time of equally accurate elements (`reference_mesh`).
 """
 
 import cmath
@@ -66,7 +66,7 @@ G = 9.8
 """Standard gravity as the paper rounds it [m/s²]; used only where accelerations are shown in g."""
 
 NULL_SHARE = 0.1
-"""Share of a map's maximum below which there may be a null."""
+"""Share of a map's maximum below which a local minimum is a null."""
 
 
 def base_amplitudes(
@@ -125,7 +125,7 @@ def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
 
 
 _MAX_POINTS = 1_000_000
-"""Most points of a map: more are finer than any screen, and take some hundred bytes each."""
+"""Maximum number of points of a map; each takes some hundred bytes."""
 
 _BATCH = 10_000  # points that are solved together, at some kilobytes each
 
@@ -274,12 +274,12 @@ def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalM
 
 
 def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
-    """Solve modes of finite elements, whose shapes are given at the nodes."""
+    """Solve the modes with finite elements; their shapes are known at the nodes."""
     check_is_plate(rig.plate, "simply-supported modes")
     if rig.plate.is_layered:
         raise InputError(
             "support must be free or eras for a plate of layers or with an air gap, got "
-            "simply-supported, for which there is no finite element solver"
+            "simply-supported, which only finite elements solve"
         )
     if not isinstance(mesh, Mesh):
         mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
@@ -295,7 +295,7 @@ MODE_COUNT = 12
 """Number of modes that are compared."""
 
 MOVED = 0.1e-3
-"""Distance [m] of an ERA from its nominal place; few are mounted better."""
+"""Typical error of an ERA's position [m]."""
 
 FOOT = 5e-3
 """Radius of a foot [m] represented by a point."""
@@ -343,8 +343,8 @@ class Convergence:
 def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own.
 
-    For a plate of layers or with air behind it, which is solved in polynomials only, there are
-    three degrees in place of meshes of elements.
+    A plate with layers or an air gap is solved with polynomials only; then there are three degrees
+    in place of meshes of elements.
     """
     plate, high = rig.plate, rig.limits.frequency_max
     check_is_plate(plate, "a study of meshes")
@@ -440,7 +440,7 @@ def _relative_error(found: ComplexArray, exact: ComplexArray) -> FloatArray:
 
 
 def _reference(rig: Rig) -> PlateMesh:
-    """Return the mesh that others are compared with: elements, or polynomials for layers."""
+    """Return the reference mesh: elements, or polynomials for a plate with layers."""
     high = rig.limits.frequency_max
     if not rig.plate.is_layered:
         return reference_mesh(rig.plate, frequency_max=high)
@@ -473,8 +473,8 @@ def finer_mesh(
 ) -> PlateMesh:
     """Return the mesh for the comparison of a mesh's response, accurate up to a frequency [Hz].
 
-    For polynomials it has two further degrees; for elements it is one of polynomials, or of
-    elements if there were too many of these. stiffness [N/m]: of the stiffest ERA.
+    For polynomials, the mesh has two additional degrees. For elements, it consists of polynomials,
+    or of elements if too many polynomials were needed. stiffness [N/m]: of the stiffest ERA.
     """
     if not isinstance(mesh, Mesh):
         return mesh.finer()

@@ -1,4 +1,4 @@
-"""Responses of a calibration: measured, of the rig file, and of the calibrated rig."""
+"""Responses of a calibration: measurement, rig file and calibrated rig."""
 
 from typing import Any
 

@@ -40,7 +40,7 @@ class MapPanel:
 def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
     """Draw maps side by side on one color scale in g (1 g = 9.8 m/s²), with ERAs.
 
-    White lines surround nulls: there the plate moves a tenth of the map's maximum.
+    White lines surround nulls: on them, the plate moves a tenth of the map's maximum.
     """
     rows = math.ceil(len(panels) / columns)
     width = 6.6 if columns == 1 else PAGE_WIDTH

@@ -1,4 +1,4 @@
-"""Style of all pictures: colors, sizes, marks of ERAs, labels of axes, and files."""
+"""Style of all pictures: colors, sizes, ERA marks, axis labels, and file formats."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ COLORS = "viridis"
 
 ACTIVE_COLOR = "#d55e00"
 RESTING_COLOR = "white"
-"""Colors of ERAs that are driven and of others, which differ in brightness, too."""
+"""Colors of driven and of resting ERAs, which also differ in brightness."""
 
 PAGE_WIDTH = 8.0
 """Width of figures with several panels [in]. A page shows it in 700 pixels: 8 pt are 10 pixels."""
@@ -28,7 +28,7 @@ SMALL_TEXT, TITLE_TEXT = 8.0, 10.0
 DPI = 150
 
 _UNDATED = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-"""Metadata with which equal figures are equal bytes."""
+"""Metadata that make files of equal figures identical."""
 
 
 def draw_eras(

@@ -51,7 +51,7 @@ def levels_figure(table: LocalizationTable) -> Figure:
     """Draw the highest level at each cell that one or two ERAs can reach."""
     levels = table.available_level_db_sl
     title = (
-        "Highest level of one or two ERAs at full amplitude\n"
+        "Maximum level with one or two ERAs at full amplitude\n"
         f"(crosses: below {FELT_DB_SL:g} dB SL; squares: ERAs)"
     )
     dead = levels < FELT_DB_SL

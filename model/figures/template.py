@@ -119,7 +119,7 @@ class Template:
 def write_template(path: Path, template: Template) -> int:
     """Write one full-scale sheet, or a PDF of A4 pages to be joined; return the number of pages.
 
-    Raises InputError for an ending that is not of a picture, and OSError.
+    Raises InputError for an ending of another file type, and OSError.
     """
     if path.suffix.lower() != ".pdf":
         left, right, _, _ = template.paper
@@ -127,7 +127,7 @@ def write_template(path: Path, template: Template) -> int:
         save_figure(_page(template, template.paper, name="", edge=0.0, scale=scale), path)
         return 1
     pages = [*template_pages(template)]
-    # Without a date, so that equal rigs make equal bytes.
+    # Without a date, so that equal rigs give identical files.
     with whole_or_nothing(path) as stream, PdfPages(stream, metadata={"CreationDate": None}) as pdf:
         for page in pages:
             pdf.savefig(page)
@@ -161,7 +161,7 @@ def _page_count(layout: tuple[int, int, float, float]) -> int:
 def _page(template: Template, box: Box, *, name: str, edge: float, scale: float = 1.0) -> Figure:
     """Draw a box of the board and the strip below it, within a white edge [mm].
 
-    scale: of the text, larger on a large sheet, which is also read on a screen.
+    scale: of the text, larger on a large sheet, which is often viewed on a screen.
     """
     low, high, bottom, top = box
     strip_height = STRIP * scale

@@ -62,12 +62,12 @@ _ERA_FIELDS = {field.name for field in fields(Era)} - {"damping", "gains"}
 _OTHER_TYPE = "; leave it out and give the values of another"
 
 _EITHER_RESONANCE = (
-    "free (the light coil moves against the magnet, as on most data sheets) or mounted (the magnet "
-    "moves behind the coil that is glued to the plate; several times lower)"
+    "free (the light coil moves against the magnet; used by most data sheets) or mounted (the "
+    "magnet moves behind the coil that is glued to the plate; several times lower)"
 )
 
 _REQUIRED = ("coil_mass", "weight", "force_factor", "resistance", "power", "resonance", "q")
-"""Keys that an exciter needs, from its type or given."""
+"""Keys that an exciter needs, from its type or from the file."""
 
 _FITTED_KEYS = {"resonance": "stiffness", "q": "damping"}
 """Keys that a fit writes, by the data-sheet key that they replace."""
@@ -85,7 +85,7 @@ class ActuatorSection(Section):
     """Rig-file key by field of the actuator, for fields that a fit changes."""
 
     instead: ClassVar[Mapping[str, tuple[str, ...]]]
-    """Alternatives that each key replaces; these keys are always written, whatever else changes."""
+    """Alternatives that each key replaces; these keys are always written."""
 
     is_electrical: ClassVar[bool] = False
     """Whether its full level is a voltage, so that its amplifier has an electrical output."""
@@ -245,8 +245,8 @@ class ExciterSection(ActuatorSection):
     """
 
     resonance_is: Literal["free", "mounted"] | None = None
-    """What the resonance refers to: `free` for the coil with the magnet held, as on most data
-    sheets; `mounted` for the magnet behind a glued coil.
+    """`free`: the coil moves and the magnet is held (on most data sheets); `mounted`: the magnet
+    moves behind a glued coil.
 
     Default: required with `resonance`
     """

@@ -92,11 +92,11 @@ ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODU
 
 ISOTROPIC = frozenset({"E", "nu"})
 ORTHOTROPIC = frozenset({"E1", "E2", "G12", "G13", "G23", "nu12"})
-"""Required numbers of an isotropic material, and of an orthotropic one (with a grain)."""
+"""Required numbers of an isotropic and of an orthotropic material (with a grain)."""
 
 
 class MaterialSection(Section):
-    """Material given by numbers: `E` and `nu`, or those along and across a grain."""
+    """Material given by numbers: `E` and `nu`, or moduli along and across a grain."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -147,7 +147,7 @@ class MaterialSection(Section):
     """Transverse shear modulus across the grain; for wood, the rolling shear modulus."""
 
     by_frequency: ModulusRows | None = None
-    """Modulus as a function of frequency, for an isotropic material; same format as in a
+    """Modulus as a function of frequency, for an isotropic material; same format as for a
     [layer](#layers).
 
     Limits: 2 rows or more, by ascending frequency
@@ -251,7 +251,7 @@ class PlateSection(Section):
     - loss_factor: not stated in the paper; 1 % is usual for a metal panel. Valid at 150 Hz; varies
       with frequency to the power of loss_exponent.
     - modes: natural frequency and loss factor of the lowest elastic modes, ascending, relative to
-      those of plate theory.
+      plate theory.
     """
 
     model_config = ConfigDict(
@@ -313,7 +313,7 @@ class PlateSection(Section):
     """
 
     measured_temperature: Temperature = STANDARD_TEMPERATURE
-    """Temperature at which the numbers of this file hold: that of the plate's measurement."""
+    """Temperature at which the numbers of this file hold; usually the measurement's."""
 
     humidity: Humidities | None = None
     """Lowest and highest relative humidity of use, such as [35 %, 65 %].
@@ -322,8 +322,8 @@ class PlateSection(Section):
     """
 
     measured_humidity: Share = STANDARD_HUMIDITY
-    """Relative humidity at which the numbers of this file hold: that of the weeks before the
-    plate's measurement."""
+    """Relative humidity at which the numbers of this file hold; usually the mean over the weeks
+    before the measurement."""
 
     modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), MODES]
     """Natural frequency and loss factor of the lowest elastic modes of the free plate, ascending,
@@ -338,8 +338,8 @@ class PlateSection(Section):
         """Relative standard deviation of the plate's modulus over density due to weather.
 
         At this value 90 % of plates keep a promise at both ends of the range; 0 without a range.
-        For layers, the change of the layer that changes most; for materials given by numbers, that
-        of the material with the same name.
+        For layers, the largest change of any layer counts. For a material given by numbers, the
+        change of the known material with the same name counts.
         """
         if self.temperature is None and self.humidity is None:
             return 0.0

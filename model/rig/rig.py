@@ -1,4 +1,4 @@
-"""Rig: a plate, its ERAs, their amplifier channels, and their uncertainties.
+"""Rig: a plate, its ERAs, their amplifier channels, and the uncertainty of its parameters.
 
 `physics_of` returns the properties of a rig that must match a table.
 """
@@ -277,7 +277,7 @@ class Rig:
 
     @property
     def uncertainty_note(self) -> str | None:
-        """One line about uncertainties assumed to be zero; None if every parameter is uncertain."""
+        """A line about uncertainties that are assumed to be zero; None if there are none."""
         if not self.exactly_known:
             return None
         return (
@@ -340,7 +340,7 @@ MAY_DIFFER = {
     "Rig.document": "repeats other fields",
     "Rig.laminate": "the solved values are in the plate",
     "Material.name": "displayed only",
-    "Surface.file": "its content is identified by its digest",
+    "Surface.file": "the digest identifies its content",
     "Surface.notes": "they follow from its modes",
 }
 """Properties in which a table's rig can differ, by class and field, each with the reason.
@@ -355,8 +355,8 @@ PHYSICS = tuple(field.name for field in fields(Rig) if f"Rig.{field.name}" not i
 def physics_of(source: object) -> dict[str, Any]:
     """Return the properties of a rig or a table that must match for equal answers, as plain data.
 
-    source: a rig, or an object with its PHYSICS. Fields by name, without empty defaults, so that
-    tables from before a field existed stay valid.
+    source: a rig, or an object with the fields in PHYSICS. Empty defaults are left out, so that
+    older tables stay valid when a field is added.
     """
     physics = {name: _plain(getattr(source, name)) for name in PHYSICS}
     # A laminate keeps its layers; its equivalent plate depends on the frequency.

@@ -80,7 +80,7 @@ def resonance_notes(rig: Rig) -> Iterator[str]:
     yield (
         f"limits.frequency: starts at {low:g} Hz, below {_ABOVE_RESONANCE:g} times the resonance "
         f"of the magnets of {', '.join(resonances)} at up to {highest:.1f} Hz, where the field "
-        f"depends on suspension and weight as much as on the plate; {advice}"
+        f"depends on the suspension, the weight and the plate alike; {advice}"
     )
 
 
@@ -95,7 +95,7 @@ def _misread_resonance(section: ExciterSection) -> str | None:
     mounted = resonance * math.sqrt(coil / weight)
     return (
         f"{resonance:g} Hz is high for a magnet of {1e3 * weight:.3g} g, and probably refers to "
-        f"the coil of {1e3 * coil:.3g} g, as on most data sheets; with resonance_is: free the "
+        f"the coil of {1e3 * coil:.3g} g, like most data sheets; with resonance_is: free the "
         f"glued magnet resonates at {mounted:.0f} Hz"
     )
 

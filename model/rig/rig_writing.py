@@ -1,8 +1,8 @@
 """Build, change and write rigs from keys, and write the results of a fit.
 
-A rig keeps the keys that it was built from, so that dependent values follow a change: damping from
-a ratio, an automatic mesh, the equivalent plate of a laminate. A user's file is never overwritten:
-a fitted rig names it as its `base` and contains only the differences.
+A rig stores its keys, so that dependent values follow a change: damping from a ratio, an automatic
+mesh, the equivalent plate of a laminate. A user's file is never overwritten: a fitted rig names it
+as its `base` and contains only the differences.
 """
 
 import math
@@ -127,8 +127,7 @@ def save_fitted(
 
 
 def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
-    """Return the rig-file keys that turn one rig into another one with the same ERAs, and no
-    others.
+    """Return only the rig-file keys that turn a rig into another rig with the same ERAs.
 
     None removes a key.
     """
@@ -364,7 +363,7 @@ def rig(
 def save_rig(rig: Rig, path: Path | str) -> None:
     """Write a rig file from which `load_rig` returns the same rig.
 
-    It contains the text of the rig's original file, or all keys if there is none. Raises InputError
+    It contains the text of the rig's original file, or all keys without a file. Raises InputError
     for a rig that a file cannot express, OSError if the file cannot be written.
 
     Example:
@@ -395,7 +394,7 @@ def change_rig(rig: Rig, **changes: Any) -> Rig:
     are computed again: damping from `damping_ratio`, the mesh if it is `auto`, the equivalent plate
     of a laminate. If the plate changes size, ERAs and masses keep their relative positions. None
     removes an ERA, or a key, whose default then applies. So fingertip=None restores the default
-    fingertip; fingertip="none" stands for a massless finger. Raises ConfigError with all problems,
+    fingertip; fingertip="none" is a massless finger. Raises ConfigError with all problems,
     InputError for `modes` identified on another plate.
 
     Example:

@@ -1,7 +1,7 @@
 """Sections of a rig file: the whole file, attachments, amplifiers, limits, and uncertainties.
 
-Sections of the plate are in `model.rig.plate_sections`, those of actuators in
-`model.rig.actuator_keys`. A section builds its part of a rig (`build`). Bounds are wide: they catch
+`model.rig.plate_sections` has the sections of the plate, `model.rig.actuator_keys` the sections of
+actuators. A section builds its part of a rig (`build`). Bounds are wide: they catch
 values in the wrong unit.
 """
 
@@ -287,7 +287,7 @@ class UncertaintySection(Section):
 
     mode_frequency: Annotated[float, _within("mode_frequency")] = Uncertainty.mode_frequency
     """Natural frequency of each mode individually, relative: the difference between a computed
-    [surface](#surface) and the one that was built.
+    [surface](#surface) and the built part.
     """
 
     mode_amplitude: Annotated[float, _within("mode_amplitude")] = Uncertainty.mode_amplitude

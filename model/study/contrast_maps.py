@@ -81,8 +81,8 @@ def map_contrast(
 ) -> ContrastMap:
     """Query a table for a finger at every position of a grid, by default its own cells.
 
-    quiet: positions [m] of one finger or more that must not feel it; drive_modes: empty for the
-    table's own; progress: called with the number of finished positions, and the total. Raises
+    quiet: positions [m] of the fingers that must not feel it; drive_modes: empty for the table's
+    mode; progress: called with the number of finished positions, and the total. Raises
     InputError for quiet fingers that no question can have, and for an unknown drive mode.
     """
     if not quiet:

@@ -119,7 +119,7 @@ def draw_plates(
 def felt_on(
     table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return what fingers feel of an excitation on d plates: level and contrast, both (d,).
+    """Return the level and contrast of an excitation at fingers on d plates, both (d,).
 
     The level is the ratio of amplitude to threshold at the weakest target. The contrast is its
     ratio to the loudest quiet point, or None without quiet fingers. Powers of tones and harmonics
@@ -223,9 +223,9 @@ def accelerations_on(
 ) -> ComplexArray:
     """Solve the acceleration (d, m, c, points) [m/s²] by base motions (m, c, eras) [m].
 
-    rows (m,): frequencies of the attached plate, whose ERAs move as at the table's. discs
-    (k, p, r): shapes at the points of each finger, which loads the first of them. The error of the
-    field is not included.
+    rows (m,): table rows, whose frequencies determine the stiffness of the attachments. discs
+    (k, p, r): shapes at the points of each finger, whose load acts at its first point. The error of
+    the field is not included.
     """
     check_scales(table.plate, plates.thickness, plates.modulus)
     omega = attached.omega[rows]

@@ -44,7 +44,7 @@ def _promise_margin(
     finger_count: int,
     rng: np.random.Generator,
 ) -> float:
-    """Return the margin [dB] of one answer for random fingers, on the plate of another table."""
+    """Return the margin [dB] of an answer for random fingers, on the plate of another table."""
     contacts = random_contacts(rng, finger_count, table.plate)
     placed = Placement(contacts[:1], contacts[1:])
     answer = query(table, placed)

@@ -77,8 +77,8 @@ def set_questions(
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     """Summarize a table, with median and tenth percentile of felt contrast [dB] over contact sets.
 
-    Promised contrasts hold on 90 % of plates, the others on the nominal plate; each has a standard
-    deviation due to the choice of the sets.
+    Promised contrasts hold on 90 % of plates, the others on the nominal plate. Each has a standard
+    error due to the choice of contact sets.
     """
     weak = overview.cells
     available = table.available_level_db_sl

@@ -1,7 +1,7 @@
-"""What errors cost: the promised contrast with a kind of error, and without it.
+"""Cost of errors: the promised contrast with a kind of error, and without it.
 
-From answers at a few positions, in a second: with clock errors of amplifiers, in the rig's weather,
-with an object on the plate, or with each tolerance of a table's rig.
+Kinds of errors are the amplifiers' clock errors, the rig's weather, an object on the plate, and
+each tolerance of a rig. The contrasts are computed at a few positions, in a second.
 """
 
 import math
@@ -34,7 +34,7 @@ _HIGHEST_FREQUENCY = 250.0  # Hz: fingers are most sensitive there, and more wou
 
 @dataclass(frozen=True)
 class PromiseCost:
-    """Contrast [dB] promised to the worst of two fingers: without a kind of error, and with it."""
+    """Promised contrast [dB] at the worst of two fingers, without and with a kind of error."""
 
     exact_db: float
     kept_db: float
@@ -49,13 +49,13 @@ def clock_cost(rig: Rig, errors: Mapping[str, float]) -> PromiseCost:
     table = _coarse_table(rig)
     clocks = ClockErrors.of([era.name for era in table.eras], rig.wiring, errors)
     exact = _promised_db(table)
-    # Built only now: the copy shares what the answers above have computed.
+    # Built after these answers, so that the copy shares their cached results.
     with_errors = table.with_clocks(clocks)
     return _cost(exact, _promised_db(with_errors))
 
 
 def uncertainty_cost(rig: Rig, key: str) -> PromiseCost:
-    """Compute the contrast of two contents as if a key of the uncertainty were 0, and as it is.
+    """Compute the contrast of two contents with a key of the uncertainty set to 0, and unchanged.
 
     Median over positions; raises the errors of `clock_cost`.
     """
@@ -68,9 +68,9 @@ def uncertainty_cost(rig: Rig, key: str) -> PromiseCost:
 def tolerance_costs(table: LocalizationTable) -> dict[str, float]:
     """Return how much each tolerance of the rig costs [dB], the most expensive first.
 
-    By key of `uncertainty`: by how much the promised contrast with one quiet finger rises if this
-    tolerance is 0, averaged over random positions. Empty if the plate is too small for two fingers,
-    or reaches the level nowhere.
+    The cost of a key of `uncertainty` is the increase of the promised contrast with one quiet
+    finger if this tolerance is 0, averaged over random positions. Empty if the plate is too small
+    for two fingers, or reaches the level nowhere.
     """
     rng = np.random.default_rng(_SEED)
     questions = []
@@ -116,7 +116,7 @@ def _promised_db(table: LocalizationTable) -> FloatArray:
 
 
 def _cost(exact: FloatArray, kept: FloatArray) -> PromiseCost:
-    # The loss is computed per position, since positions differ far more.
+    # The loss is computed per position, because contrasts differ much more between positions.
     loss = max(float(np.median(exact - kept)), 0.0)
     median = float(np.median(exact))
     return PromiseCost(median, median - loss)

@@ -1,4 +1,4 @@
-"""Export a table to other programs: a .mat file of everything, or .csv files.
+"""Export a table for other programs: a complete .mat file, or .csv files.
 
 `docs/reference/table-file.md` lists every name with its shape and unit.
 """
@@ -79,7 +79,7 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
 def _mat_content(table: LocalizationTable) -> dict[str, Any]:
     names = _names_with_units()
     rig_values = {}
-    for key in PHYSICS:  # everything of the rig that a table must have
+    for key in PHYSICS:  # all properties of the rig that a table contains
         names_of_key = {} if key == "uncertainty" else names
         rig_values[key] = _exported(getattr(table, key), names_of_key)
     return {

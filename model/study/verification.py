@@ -78,14 +78,14 @@ MIN_KEPT_SHARE = 0.8
 
 KEPT_SHARE_STD = 0.06
 """Standard deviation of this fraction between the answers of a table: 0.03 to 0.06 in the example
-rigs. A mean over few answers may therefore be lower (`PromiseCheck.required_share`)."""
+rigs. A mean over few answers can therefore be lower (`PromiseCheck.required_share`)."""
 
 SAMPLED_FREQUENCIES = 3
 
 _RMS_GRID = Grid(8, 6)  # points over which the root mean square of a field is taken
 _ONSET_RAMP = 0.02  # s
 _WINDOW = 0.25  # s, over which steady amplitudes are evaluated
-_REMAINING = 1e-4  # fraction of the free vibration that may remain when the window starts
+_REMAINING = 1e-4  # maximum fraction of the free vibration at the start of the window
 _MAX_DURATION = 20.0  # s
 
 
@@ -175,7 +175,7 @@ class PromiseCheck:
 
     @property
     def is_passed(self) -> bool:
-        """Whether enough plates keep it."""
+        """Whether enough plates keep their promise."""
         return self.kept_share >= self.required_share
 
 
@@ -355,9 +355,9 @@ def _check_answer(
 
 @dataclass(frozen=True, eq=False)
 class _DirectSensation:
-    """What fingers feel of an answer, as ratios of amplitude to the thresholds of one set.
+    """Vibration at the fingers of an answer, as ratios of amplitude to the thresholds of a set.
 
-    The target's points come first; its weights (p,) are those of `fingertip_weights`.
+    The target's points come first; their weights (p,) are `fingertip_weights`.
     """
 
     at_fingers: FloatArray
@@ -415,9 +415,9 @@ class _DirectSensation:
 def field_error(table: LocalizationTable, frequency: float) -> float:
     """Return the error of fields between points of the grid and mesh, and under fingers.
 
-    Relative to the field's root mean square. It is next to zero for polynomials of high degree, but
-    elements of the first order make straight lines of a wave. Modes that change with frequency are
-    computed one by one.
+    Relative to the field's root mean square. The error is almost zero for polynomials of high
+    degree. Elements of the first order replace a wave by straight lines. Modes that depend on the
+    frequency are computed individually.
     """
     finger_error = 0.0 if table.fingertip is None else FINGER_ERROR
     interpolation_error = table.mesh.interpolation_error(table.plate, frequency)

@@ -1,7 +1,7 @@
-"""Where a plate's fingers are told apart: promised contrast of each cell to random other fingers.
+"""Promised contrast of each cell of a plate to another finger at random positions.
 
-For the center of each cell as the target, the promised contrast (90 % of plates) to another finger
-at random positions at least 5 cm away. A cell is *feasible* if the median other finger leaves 12 dB
+The target is at the center of the cell, the other finger at least 5 cm away. The contrast holds on
+90 % of plates. A cell is *feasible* if the median other finger leaves 12 dB
 at 20 dB SL: at 12 dB SL, which is clearly felt, the other finger is then at its threshold. It is
 *weak* if the contrast is lower for more than 10 % of the other fingers.
 """
@@ -35,8 +35,8 @@ WANTED_LEVEL_DB_SL = STRONG_DB_SL
 STRATA = (2, 2)
 """Strata of a quarter of the plate, with one random position of the other finger in each.
 
-The mirror images of these positions in both axes are used, too, so that a symmetric plate has a
-symmetric map, with less variance than from positions drawn freely.
+Mirror images in both axes are used, too. A symmetric plate therefore has a symmetric map, with less
+variance than with independent positions.
 """
 
 Contrasts: TypeAlias = tuple[float, float]
@@ -109,7 +109,7 @@ def map_grid(table: LocalizationTable) -> Grid:
 def find_weak_cells(
     table: LocalizationTable, answered: Sequence[Sequence[Contrasts | None]]
 ) -> WeakCells:
-    """Make the map from answers to `pair_questions`, cell by cell."""
+    """Compute the map from answers to `pair_questions`, cell by cell."""
     grid = map_grid(table)
     percentiles = np.full((2, len(answered)), np.nan)
     errors = np.full((2, len(answered)), np.nan)
@@ -125,11 +125,11 @@ def find_weak_cells(
 
 
 def sampling_error(values: ArrayLike, percent: float) -> float:
-    """Return one standard deviation of a percentile of a random sample (n,), NaN if not finite.
+    """Return the standard error of a percentile of a random sample (n,), NaN if not finite.
 
-    For any distribution of the values: half the distance between the order statistics one standard
-    deviation of the number of values below the percentile away from it. Equal values count once,
-    since they come from mirrored queries.
+    It is valid for any distribution: half the distance between two order statistics. Their ranks
+    are those of the percentile plus and minus one standard deviation of the number of values below
+    it. Equal values count once, since they come from mirrored queries.
     """
     sample = np.asarray(values, dtype=float)
     count = len(np.unique(sample))
@@ -179,7 +179,7 @@ def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
 
 
 def _positions_over(plate: Plate, *, seed: list[int]) -> FloatArray:
-    """Draw random positions (n, 2) [m] all over a plate, with all their mirror images on it."""
+    """Draw random positions (n, 2) [m] over the whole plate, and their mirror images."""
     columns, rows = (np.arange(count) for count in STRATA)
     strata = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
     offsets = np.random.default_rng(seed).uniform(0, 1, strata.shape)
@@ -190,10 +190,10 @@ def _positions_over(plate: Plate, *, seed: list[int]) -> FloatArray:
 
 
 def ask_once(table: LocalizationTable) -> Ask:
-    """Return a function that answers questions with their contrasts, each only once.
+    """Return a function that returns the contrasts of questions, and computes each only once.
 
-    Questions that mirror each other have one answer if plate, ERAs and masses are symmetric, so
-    that noise of the drawn plates does not turn one sample into several.
+    If plate, ERAs and masses are symmetric, questions that mirror each other share an answer.
+    Otherwise, noise of the drawn plates would turn a single sample into several.
     """
     images = mirror_images(table)
     answers: dict[Placement, Contrasts | None] = {}

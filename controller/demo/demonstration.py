@@ -65,14 +65,13 @@ _CONTACT_TIMEOUT = 2.0
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
 
-RECOVERY_TIMEOUT = 30.0
-"""Time [s] within which the daemon must be armed, also again after a fault."""
+READY_TIMEOUT = 30.0
+"""Time [s] within which the daemon must be ready to be armed."""
 
 _RIG_FILE = "rig.yaml"
 _RECORDER = ("127.0.0.1", 3333)  # host and port of the sender of recorded touches
-_ARMED = DaemonState.OPERATION_ENABLED
 _TIMEOUT = 60.0  # s; of a request to the daemon, on a machine that is busy
-_PAUSE = 0.05  # s; between attempts to arm
+_PAUSE = 0.05  # s; between two looks at the state
 
 _TWO = {"left": None, "right": None}
 _THREE = {"left": (70, 110), "middle": (180, 220), "right": (250, 300)}  # Hz
@@ -223,14 +222,12 @@ async def run_demo(
                         watchdog=SIMULATED_WATCHDOG,
                     )
                     serving = tasks.create_task(daemon.run(lock))
-                    arming = tasks.create_task(keep_armed(daemon, config.socket, recorder))
                     playing = tasks.create_task(
-                        play_scenes(scenes, touches, recorder, config.socket)
+                        play_scenes(scenes, touches, recorder, daemon, config.socket)
                     )
                     await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
                     if not playing.done():  # a signal has ended the daemon
                         raise KeyboardInterrupt
-                    arming.cancel()
                     daemon.shut_down("the demonstration is over")
             except BaseExceptionGroup as failures:
                 raise failures.exceptions[0] from None
@@ -345,62 +342,42 @@ def check_page(address: str) -> None:
         ) from error
 
 
-async def keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
-    """Arm a daemon at a socket, and again after every fault, such as a stalled machine.
-
-    Raises LinkError if that takes too long.
-    """
-    await daemon.started.wait()
-    async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
-        await era.subscribe("state")
-        while True:
-            lease = await _armed(era)
-            recorder.armed()
-            while (status := await era.status()).state == _ARMED:
-                await era.next_event(timeout=MAX_LEASE / 4)
-                with contextlib.suppress(RpcError):  # the lease ends with the state
-                    await era.renew(lease)
-            recorder.failed(status.cause)
-
-
-async def _armed(era: AsyncClient) -> str:
-    """Clear a fault, but no stop, and arm; return the lease.
-
-    Raises LinkError after `RECOVERY_TIMEOUT`.
-    """
-    end = threads.now() + RECOVERY_TIMEOUT
-    while True:
-        status = await era.status()
-        if status.state == DaemonState.QUICK_STOP_ACTIVE or threads.now() > end:
-            raise LinkError(f"demonstration aborted: {status.cause}")
-        with contextlib.suppress(RpcError):  # the state has changed meanwhile
-            if status.state == DaemonState.FAULT:
-                await era.clear()
-            if status.state == DaemonState.READY_TO_SWITCH_ON:
-                return (await era.arm("the demonstration", lease_s=MAX_LEASE)).lease
-        await asyncio.sleep(_PAUSE)
-
-
 async def play_scenes(
     scenes: Sequence[Scene],
     touches: RecordedTouches,
     recorder: TouchRecorder,
+    daemon: Daemon,
     path: Path,
 ) -> None:
-    """Play the scenes to a daemon at a socket; wait until all touches are lifted, or count as such.
+    """Arm a daemon at a socket, play the scenes to it, and wait until all touches are lifted.
 
-    Raises LinkError after a fault that lasts.
+    Raises LinkError if it cannot be armed, or is disarmed meanwhile.
     """
-    await recorder.start()
-    for number, scene in enumerate(scenes):
-        async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
-            await era.layout(_layout_name(number))
-        await touches.play(scene.touches)
-        while recorder.touches:  # noqa: ASYNC110  nothing else waits for this
-            await asyncio.sleep(DECAY)
-    await asyncio.sleep(DECAY)
-    if recorder.fault is not None:
-        raise LinkError(f"demonstration aborted: {recorder.fault}")
+    await daemon.started.wait()
+    async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
+        try:
+            await _wait_until_ready(era)
+            async with era.armed("the demonstration", lease_s=MAX_LEASE):
+                recorder.start()
+                for number, scene in enumerate(scenes):
+                    await era.layout(_layout_name(number))
+                    await touches.play(scene.touches)
+                    while recorder.touches:  # noqa: ASYNC110  nothing else waits for this
+                        await asyncio.sleep(DECAY)
+                await asyncio.sleep(DECAY)
+        except RpcError as error:
+            raise LinkError(f"demonstration aborted: {error}") from error
+
+
+async def _wait_until_ready(era: AsyncClient) -> None:
+    """Wait until the daemon can be armed; raises LinkError after `READY_TIMEOUT`."""
+    end = threads.now() + READY_TIMEOUT
+    status = await era.status()
+    while status.state != DaemonState.READY_TO_SWITCH_ON:
+        if threads.now() > end:
+            raise LinkError(f"demonstration aborted: {status.cause}")
+        await asyncio.sleep(_PAUSE)
+        status = await era.status()
 
 
 def _layout_name(number: int) -> str:

@@ -89,15 +89,10 @@ class TouchRecorder:
         self.rows: list[TouchRow] = []
         self.touches: dict[ContactKey, _Touch] = {}
         """Current touches."""
-        self.fault: str | None = None
-        """Why the plate is no longer armed; None while armed, and before."""
-        self.faults: list[str] = []
-        """Every cause of disarming so far."""
         self.rejected_sets = 0
         """Number of sets that an amplifier or its ledger has rejected."""
         self.worst_delay = 0.0
         """Longest time [s] from a touch to its pattern, or for the plate's sensors to follow."""
-        self._is_armed = asyncio.Event()
         self._plate = plate
         self._tasks = tasks
         self._on_row = on_row
@@ -115,8 +110,6 @@ class TouchRecorder:
 
     def why_void(self) -> str | None:
         """Return why a real-time run is void; None if it is valid."""
-        if self.faults:
-            return f"the amplifiers stopped ({self.faults[0]})"
         if self.worst_delay > _MAX_DELAY:
             delay_ms = 1000 * self.worst_delay
             return f"a reaction took {delay_ms:.0f} ms, more than {1000 * _MAX_DELAY:.0f} ms"
@@ -124,25 +117,9 @@ class TouchRecorder:
             return f"amplifiers rejected {counted(self.rejected_sets, 'set')}"
         return None
 
-    async def start(self) -> None:
-        """Wait until the plate is armed, and set the start of the recording to then."""
-        await self._is_armed.wait()
+    def start(self) -> None:
+        """Set the start of the recording to now."""
         self._start = threads.now()
-
-    def armed(self) -> None:
-        """Note that the plate is armed, again after a fault."""
-        self.fault = None
-        self._is_armed.set()
-
-    def failed(self, cause: str) -> None:
-        """Note that the plate is armed no longer; rows of touches that this spoils say so."""
-        self.fault = cause.partition("; ")[0]  # without its remedy
-        self.faults.append(self.fault)
-        since = -math.inf if self._playing is None else self._playing.applied.time
-        self._end_pattern(threads.now(), is_measured=False)  # silent since an unknown time
-        for touch in self.touches.values():
-            if touch.contact.since > since:
-                touch.reason = self.fault
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self._move_sensors(contacts)
@@ -153,7 +130,7 @@ class TouchRecorder:
             for other_contact in contacts:
                 if other_contact != contact:
                     quiet[sensor_id(other_contact)] = position_of(other_contact)
-            self.touches[contact.key] = _Touch(contact, quiet, reason=self.fault)
+            self.touches[contact.key] = _Touch(contact, quiet)
         for contact in change.up:
             touch = self.touches.pop(contact.key)
             touch.contact = contact
@@ -182,7 +159,7 @@ class TouchRecorder:
         for touch in touches:
             touch.patterns.append(pattern)
 
-    def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:
+    def _end_pattern(self, now: float) -> None:
         """Close the playing pattern and measure its end."""
         pattern = self._playing
         if pattern is None:
@@ -196,7 +173,7 @@ class TouchRecorder:
         start, end = max(intervals, key=lambda interval: interval[1] - interval[0])
         since = max(start, end - STEADY_WINDOW) + _MARGIN
         until = end - _MARGIN
-        if is_measured and since < until:
+        if since < until:
             pattern.steady = self._tasks.create_task(self._plate.vibration(since, until))
         for touch in pattern.touches:
             self._complete(touch)

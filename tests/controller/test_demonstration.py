@@ -15,6 +15,7 @@ from unittest.mock import AsyncMock
 import numpy as np
 import pytest
 
+from controller.api.client import AsyncClient
 from controller.demo import demo_pictures, demonstration
 from controller.demo import simulated_plate as far_end
 from controller.demo.demo_pictures import Pictures
@@ -27,8 +28,7 @@ from controller.demo.demonstration import (
 from controller.demo.recorder import TouchRecorder
 from controller.demo.simulated_plate import FingerVibration, SimulatedPlate, simulated_plate
 from controller.demo.touch_rows import FingerRow, TouchRow, steady_contrast_db
-from controller.play.reports import Observers, PlayReport
-from controller.play.selected_contents import not_served
+from controller.play.reports import Observers
 from controller.sources.touch import Change, Contact, ContactKey, TouchFrame
 from controller.sources.tuio import TuioSource
 from drivers.errors import LinkError
@@ -39,7 +39,7 @@ from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table import table_file
 from model.table.table_file import build_table
-from processes.daemons import ENABLED, ready_daemon, until, until_state
+from processes.daemons import ENABLED, ready_daemon, until_state
 from registry import threads
 from registry.virtual_time import VirtualTimeLoop
 from sim.faults import FaultWindow
@@ -271,34 +271,6 @@ async def recorder_of(rows: list[TouchRow], **plate: AsyncMock) -> AsyncIterator
         yield TouchRecorder(cast(SimulatedPlate, asked), tasks, on_row=rows.append)
 
 
-async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> None:
-    """The touch that was down at the fault and the one that came later; no other one."""
-    rows: list[TouchRow] = []
-    near, down, later, last = (contact(number) for number in range(4))
-    async with recorder_of(rows) as recorder:
-        loop = Observers()
-        recorder.observe(loop)
-        (changed,), (reported,) = loop.contacts_changed, loop.reported
-        changed((near,), Change(down=(near,)))
-        reason = "too close to an edge"
-        held_back = (not_served(near, reason),)
-        reported(PlayReport((near,), held_back, None, threads.now(), reason=reason))
-        changed((), Change(up=(near,)))
-        changed((down,), Change(down=(down,)))
-        recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
-        changed((), Change(up=(down,)))
-        changed((later,), Change(down=(later,)))
-        changed((), Change(up=(later,)))
-        assert recorder.fault == FAULT
-        recorder.armed()
-        changed((last,), Change(down=(last,)))
-        changed((), Change(up=(last,)))
-    reasons = [row.reason for row in rows]
-    assert reasons[:3] == ["too close to an edge", FAULT, FAULT]
-    assert reasons[3] != FAULT
-    assert recorder.fault is None
-
-
 @pytest.mark.parametrize(
     ("delay", "is_void"), [(0.149, False), (0.151, True)], ids=["short enough", "too long"]
 )
@@ -321,17 +293,14 @@ def test_run_is_void_when_sensors_follow_a_finger_too_late(delay: float, is_void
     assert (why_void is not None and "151 ms" in why_void) == is_void
 
 
-async def test_run_is_void_after_a_rejected_set_and_after_a_fault() -> None:
-    """Also once the plate is armed again; not before."""
+async def test_run_is_void_after_a_rejected_set() -> None:
+    """A set that an amplifier or its ledger has rejected."""
     async with recorder_of([]) as recorder:
         loop = Observers()
         recorder.observe(loop)
         assert recorder.why_void() is None
         loop.refused[0]("too late")
         assert "rejected 1 set" in str(recorder.why_void())
-        recorder.failed(FAULT)
-        recorder.armed()
-        assert FAULT in str(recorder.why_void())
 
 
 def test_demo_gives_the_same_rows_on_a_slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -357,38 +326,30 @@ def test_demo_gives_the_same_rows_on_a_slow_machine(monkeypatch: pytest.MonkeyPa
     assert any(row["measured_level_db_sl"] is not None for row in prompt)
 
 
+@pytest.mark.parametrize("silenced_by", ["over_voltage", "stop"])
 @in_virtual_time
-async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+async def test_silenced_plate_aborts_the_demonstration(
+    silenced_by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After one of amplifiers that stalled it is cleared, and the recorder hears of both."""
-    monkeypatch.setattr(demonstration, "RECOVERY_TIMEOUT", 5.0)
+    """A fault of an amplifier or a stop ends it with the cause, and nothing arms again."""
+    monkeypatch.setattr(AsyncClient, "layout", AsyncMock())
     async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, era):
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
-        arming = asyncio.create_task(demonstration.keep_armed(bench.daemon, bench.socket, recorder))
-        await recorder.start()
-        await until_state(era, ENABLED)
-        bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
-        await until(lambda: recorder.fault is not None)
-        await until(lambda: recorder.fault is None or arming.done())
-        assert not arming.done()
-        await until_state(era, ENABLED)
-        await era.stop()
-        with pytest.raises(LinkError, match="aborted: stopped"):
-            await arming
-        assert (await era.status()).state == "QUICK_STOP_ACTIVE"
 
+        async def silence(recording: object) -> None:
+            await until_state(era, ENABLED)
+            if silenced_by == "stop":
+                await era.stop()
+            else:
+                bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
+                await until_state(era, "FAULT")
 
-@in_virtual_time
-async def test_fault_that_lasts_aborts_the_demonstration() -> None:
-    """At the end, for the cause of the fault, though all scenes have been played."""
-    async with asyncio.TaskGroup() as tasks:
-        recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
-        recorder.armed()
-        recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
-        nothing = cast(Any, None)
-        with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
-            await demonstration.play_scenes([], nothing, recorder, nothing)
+        playing = cast(Any, SimpleNamespace(play=silence))
+        with pytest.raises(LinkError, match=r"demonstration aborted: lease lost: (fault|stopped)"):
+            await demonstration.play_scenes(
+                [Scene([])], playing, recorder, bench.daemon, bench.socket
+            )
+        assert (await era.status()).state in ("FAULT", "QUICK_STOP_ACTIVE")
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(

@@ -210,9 +210,9 @@ def test_pattern_of_points_has_both_curves_and_the_taps() -> None:
     [
         ([], "points and taps must be 1 to 500 together, got 0"),
         ([(0, 0, 0)] * 501, "points and taps must be 1 to 500 together, got 501"),
-        ([(0, 0)], r"points\[0\] must be \[time_s, intensity, sharpness\], got 2 values"),
-        ([(1, 0, 0), (0, 0, 0)], r"points\[1\] time_s must be 1 to 60, got 0"),
-        ([(0, math.nan, 0)], r"points\[0\] intensity must be 0 to 1, got nan"),
+        ([(0, 0)], r"must be \[time_s, intensity, sharpness\], got 2 values in entry 0"),
+        ([(1, 0, 0), (0, 0, 0)], r"time of intensity\[1\] must be 1 to 60 s, got 0 s"),
+        ([(0, math.nan, 0)], r"intensity\[0\] must be 0 to 1, got nan"),
     ],
     ids=["none", "many", "short", "order", "not a number"],
 )

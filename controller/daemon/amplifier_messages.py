@@ -106,15 +106,12 @@ def _history(amplifier: Amplifier | None, targets: Sequence[str], now: float) ->
         for kind, reported_at in amplifier.reported_at.items():
             if reported_at > now - REPORT_LIFE:
                 reports.append(_report(kind, targets))
-    counts = {}
-    for key in LinkCounters.model_fields.keys() - {"round_trip_ms"}:
-        counts[key] = getattr(statistics, key)
-    round_trip_ms = in_milliseconds(statistics.last_round_trip)
+    counts = {**vars(statistics), "round_trip_ms": in_milliseconds(statistics.last_round_trip)}
     return {
         "serial_number": serial_number,
         "reply_age_s": reply_age,
         "reports": reports,
-        "statistics": LinkCounters(**counts, round_trip_ms=round_trip_ms),
+        "statistics": LinkCounters.model_validate(counts, extra="ignore"),
     }
 
 

@@ -17,9 +17,8 @@ import pickle
 import secrets
 import subprocess
 import sys
-import threading
+import tempfile
 from pathlib import Path
-from typing import IO, cast
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.process.child import child_command, ended
@@ -88,54 +87,33 @@ def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
     Raises InputError with all problems, also for a plug-in that was installed or changed after this
     process started, and OSError if the child cannot be started or fails.
     """
-    expired = threading.Event()
-
-    def expire() -> None:
-        expired.set()
-        process.kill()
-
-    config: object = None
-    with subprocess.Popen(  # noqa: S603  our own module
-        child_command("controller.daemon.children", str(file)),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is handled by the daemon
-    ) as process:
-        timer = threading.Timer(_READ_TIMEOUT, expire)
-        timer.start()
+    with tempfile.TemporaryFile() as output:
         try:
-            config = _exchanged(process, frequencies)
-        except (EOFError, OSError, pickle.UnpicklingError) as error:
-            _logger.debug("config: child ended early: %s", error)
+            process = subprocess.run(  # noqa: S603  our own module
+                child_command("controller.daemon.children", str(file)),
+                input=pickle.dumps(frequencies),
+                stdout=output,
+                timeout=_READ_TIMEOUT,
+                start_new_session=True,  # Ctrl-C is handled by the daemon
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise TimeoutError(f"reading {file} took longer than {_READ_TIMEOUT:g} s") from error
+        if process.returncode != 0:
+            raise OSError(f"reading {file} failed with status {process.returncode}")
+        output.seek(0)
+        try:
+            # Each read of the file lets other threads run; the bytes of many layouts, hundreds of
+            # megabytes, would hold the interpreter for too long.
+            config = pickle.load(output)  # noqa: S301  of our own process
         except (ImportError, AttributeError, TypeError) as error:
-            process.kill()  # it would wait for a reader of the rest
             raise InputError(
                 f"{file} uses a plug-in that was installed or changed after the daemon started "
                 f"({error}); restart the daemon"
             ) from error
-        finally:
-            status = process.wait()
-            timer.cancel()
-    if expired.is_set():
-        raise TimeoutError(f"reading {file} took longer than {_READ_TIMEOUT:g} s")
-    if status != 0:
-        raise OSError(f"reading {file} failed with status {status}")
     if isinstance(config, DaemonConfig):
         return config
     raise InputError(str(config))
-
-
-def _exchanged(process: "subprocess.Popen[bytes]", frequencies: FloatArray) -> object:
-    """Send the frequencies to the child, and return the object that it sends back.
-
-    The object is loaded as it arrives, and each read of the pipe lets other threads run. Joining
-    the bytes of many files first, hundreds of megabytes, would hold the interpreter for too long.
-    """
-    stdin = cast(IO[bytes], process.stdin)
-    with stdin:
-        pickle.dump(frequencies, stdin)
-    config: object = pickle.load(cast(IO[bytes], process.stdout))  # noqa: S301  of our own process
-    return config
 
 
 def _main() -> None:

@@ -168,24 +168,18 @@ def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
     restart = [key for key in old_values if _needs_restart(key, old_values, new_values)]
     if old.rig_text != new.rig_text and "rig" not in restart:
         restart.append("rig")
-    changed: set[str | None] = set()
+    names = {**old.layouts, **new.layouts}
+    changed = [name for name in names if old.layouts.get(name) != new.layouts.get(name)]
     changes = []
-    for name in {**old.layouts, **new.layouts}:
-        if old.layouts.get(name) == new.layouts.get(name):
-            continue
-        changed.add(name)
-        if name is None:
-            continue
-        if name not in old.layouts:
-            changes.append(f"layouts.{name}: added")
-        elif name in new.layouts:
-            changes.append(f"layouts.{name}: changed")
-        else:
-            changes.append(f"layouts.{name}: removed")
+    for name in changed:
+        if name is not None:
+            change = "removed" if name not in new.layouts else "changed"
+            changes.append(f"layouts.{name}: {change if name in old.layouts else 'added'}")
     old_level = old_values["level_db_sl"]
     new_level = new_values["level_db_sl"]
     if old_level != new_level:
         changes.append(f"level_db_sl: from {old_level:g} to {new_level:g}")
+    # Unchanged layouts keep their rendered effects.
     layouts = dict(new.layouts)
     for name in layouts.keys() - changed:
         layouts[name] = old.layouts[name]

@@ -5,12 +5,11 @@ Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `reload`, `strength`, `touc
 """
 
 import json
-import math
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -255,17 +254,14 @@ def _report_fingers(
 
 def position_on(path: Sequence["Point"], share: float) -> "Point":
     """Return the position [m] on straight lines between points, after a share of their length."""
-    lines = list(pairwise(path))
-    lengths = [math.dist(start, end) for start, end in lines]
-    remaining = share * sum(lengths)
-    for (start, end), length in zip(lines, lengths, strict=True):
-        if remaining < length:
-            fraction = remaining / length
-            x = start[0] + fraction * (end[0] - start[0])
-            y = start[1] + fraction * (end[1] - start[1])
-            return x, y
-        remaining -= length
-    return path[-1]
+    import numpy as np
+
+    points = np.array(path)
+    steps = np.diff(points, axis=0)
+    lengths = np.hypot(*steps.T)
+    distances = np.append(0.0, np.cumsum(lengths))
+    x, y = [float(np.interp(share * distances[-1], distances, column)) for column in points.T]
+    return x, y
 
 
 def watch(

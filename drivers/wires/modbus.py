@@ -455,7 +455,7 @@ class ModbusAddress(WireAddress):
     ) -> Port:
         """Open the port; raises LinkError."""
         if not self.place.device:
-            return await open_port(self.place, on_data, on_loss)
+            return await super().open_port(on_data, on_loss)
         port = SilentPort(self.make_wire().silence, self.place.byte_time, on_data)
         port.below = await open_port(self.place, port.received, on_loss)
         return port

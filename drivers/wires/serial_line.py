@@ -6,11 +6,11 @@ serial+tcp://HOST:PORT?baud=921600&address=1     a serial server with raw TCP
 
 import random
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 from drivers.errors import WireCounters
-from drivers.ports import NETWORK_DELAY, Port, open_port
+from drivers.ports import NETWORK_DELAY
 from drivers.protocol.definition import BOOT_TIME, EVENT, HELLO, NAK, REQUESTS, VERSION, Message
 from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
@@ -178,9 +178,3 @@ class SerialAddress(WireAddress):
         """Make the wire with a random number, so that a reply to an earlier host does not match."""
         delay = 0.0 if self.place.device else NETWORK_DELAY
         return SerialWire(self.place.baud, sequence=random.getrandbits(16), delay=delay)
-
-    async def open_port(
-        self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-    ) -> Port:
-        """Open the port; raises LinkError."""
-        return await open_port(self.place, on_data, on_loss)

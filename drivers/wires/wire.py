@@ -16,7 +16,7 @@ from functools import cache
 from typing import ClassVar, Protocol, TypeAlias
 
 from drivers.errors import CommandError, LinkError, WireCounters
-from drivers.ports import Port
+from drivers.ports import Port, open_port
 from drivers.protocol.definition import (
     EVENT,
     EVENT_RECORD,
@@ -282,15 +282,15 @@ class WireAddress(ABC):
                     f"got {got}"
                 )
 
-    @abstractmethod
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
         """Open the port of the line, for this program alone if the system can; raises LinkError.
 
-        on_data: is called with received bytes, as `Wire.received` takes them; on_loss: is called
-        once with the cause of a loss.
+        By default it is the serial device or TCP port `place`. on_data: is called with received
+        bytes, as `Wire.received` takes them; on_loss: is called once with the cause of a loss.
         """
+        return await open_port(self.place, on_data, on_loss)
 
 
 class PortAbove:

@@ -7,9 +7,12 @@ result, words). Not modeled: parity and collisions on a serial line.
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 
 from drivers.protocol.definition import BROADCAST, NAK, Message
+from drivers.urls import RTU_BAUD
 from drivers.wires.modbus_frames import (
     AREA,
     BOX,
@@ -30,6 +33,7 @@ from drivers.wires.modbus_frames import (
     response_pdu,
 )
 from sim.transport.far_end import AmplifierPort, FarEnd, SendBytes, carry_out
+from sim.transport.serving import FarEndKind, MakeEnd, Numbered
 
 FRAME_TIMEOUT = 0.02
 """Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
@@ -188,3 +192,31 @@ class _Unit:
         elif message.name == "SetAddress":
             self.is_moving = self.address > 0 and reply.result == 0
         return reply
+
+
+class SharedUnits(FarEndKind):
+    """A kind of wire whose units are shared by all connections."""
+
+    def serve(self, speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
+        """Serve amplifiers by unit; yields how to make the far end of a connection."""
+        units = ModbusAmplifiers(numbered, lambda data: None, is_rtu=False)
+        return nullcontext(units.of_connection)
+
+
+MODBUS_TCP_KIND = SharedUnits(
+    "modbus-tcp",
+    "modbus+tcp://{host}:{port}/{address}",
+    "a loopback port with a unit per amplifier; any free port if PORT is omitted",
+    RTU_BAUD,
+    "ethernet",
+    ModbusAmplifiers,
+)
+MODBUS_RTU_KIND = FarEndKind(
+    "modbus-rtu",
+    "modbus+rtu://{port}?baud={speed}#{address}",
+    "a pseudo-terminal with a unit per amplifier",
+    RTU_BAUD,
+    "usb-high-speed",
+    partial(ModbusAmplifiers, is_rtu=True),
+    bits=11,
+)

@@ -18,6 +18,7 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
+from drivers.urls import BAUD
 from drivers.wires.serial_frames import (
     NEUTRAL,
     REPLY_BIT,
@@ -30,6 +31,7 @@ from drivers.wires.serial_frames import (
     words_of,
 )
 from sim.transport.far_end import AmplifierPort, FarEnd, SendBytes, carry_out
+from sim.transport.serving import FarEndKind
 
 _SET_ADDRESS = MESSAGES["SetAddress"].number
 
@@ -109,3 +111,14 @@ def _nak_words(frame: Frame, refusal: Refusal) -> Sequence[int]:
     if frame.version == VERSION and is_earlier_part(frame.type, whole_words):
         return ()
     return nak_of(refusal, frame.type)
+
+
+SERIAL_KIND = FarEndKind(
+    "serial",
+    "serial://{port}?baud={speed}&address={address}",
+    "a pseudo-terminal; `--shared` puts all amplifiers on one, at addresses 1, 2, ...",
+    BAUD,
+    "usb-high-speed",
+    SerialAmplifiers,
+    bits=10,
+)

@@ -11,15 +11,23 @@ identifiers, discovery by broadcast.
 
 import asyncio
 import re
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 
-from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, pack_frames, unpack_frames
+from drivers.wires.can_frames import (
+    BITRATE,
+    SLCAN,
+    SOCKETCAND,
+    CanFrame,
+    pack_frames,
+    unpack_frames,
+)
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.transport.far_end import FarEnd, SendBytes
-from sim.transport.serving import TimedFarEnd
+from sim.transport.serving import FarEndKind, MakeEnd, Numbered, TimedFarEnd
 from sim.transport.simulated_line import TwoWayLine
 
 BUS_NAME = "can0"
@@ -239,3 +247,37 @@ class SocketcandClient(FarEnd):
     def _hear(self, frame: CanFrame) -> None:
         stamp = f"{threads.now():.6f}"  # only differences are meaningful
         self._send(f"< frame {frame.id:03X} {stamp} {frame.data.hex().upper()} >".encode())
+
+
+class BehindAdapter(FarEndKind):
+    """A kind of wire that is an adapter to a CAN bus with the amplifiers."""
+
+    def url_of(self, *, port: int | str, speed: int, address: int) -> str:
+        """The URL of an amplifier, without options that have their default values."""
+        url = super().url_of(port=port, speed=speed, address=address)
+        return url.replace(f"{BUS_NAME}?bitrate={BITRATE}#", f"{BUS_NAME}#")
+
+    @contextmanager
+    def serve(self, speed: int | None, numbered: Numbered) -> Iterator[MakeEnd]:
+        """Serve amplifiers by node on a bus; yields how to make an adapter."""
+        devices = [*numbered.values()]
+        with closing(CanBus(speed)) as bus, closing(BusNodes(bus, devices)):
+            yield partial(self.end, bus)
+
+
+SOCKETCAND_KIND = BehindAdapter(
+    "socketcand",
+    f"can+socketcand://{{host}}:{{port}}/{BUS_NAME}?bitrate={{speed}}#{{address}}",
+    "a CAN bus behind a loopback port",
+    BITRATE,
+    "can",
+    SocketcandClient,
+)
+SLCAN_KIND = BehindAdapter(
+    "slcan",
+    "can+slcan://{port}?bitrate={speed}#{address}",
+    "a CAN bus behind a pseudo-terminal",
+    BITRATE,
+    "can-usb",
+    SlcanAdapter,
+)

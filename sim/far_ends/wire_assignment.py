@@ -1,39 +1,28 @@
 """Wires of simulated amplifiers: a wire for each amplifier, and the far end of each wire.
 
 A far end is an asynchronous context in which devices reply on a real wire; it yields the URL of
-each amplifier by name. A new kind is a row of `FAR_ENDS`.
+each amplifier by name. The module of each far end declares its kinds (`FarEndKind`).
 """
 
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import (
-    AbstractContextManager,
-    AsyncExitStack,
-    asynccontextmanager,
-    closing,
-    contextmanager,
-    nullcontext,
-)
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
+import sim.far_ends
 from drivers.errors import CommandError
-from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD
-from drivers.wires.can_frames import BITRATE
+from drivers.urls import ADDRESS, KIND_OF_PORT
 from drivers.wires.wire import address_of
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.far_ends.simulated_bus import BUS_NAME, BusNodes, CanBus, SlcanAdapter, SocketcandClient
 from sim.faults import Faults
-from sim.transport.far_end import FarEnd, SendBytes
-from sim.transport.serving import HOST, MakeEnd, TcpEnd, TerminalEnd
+from sim.transport.serving import FarEndKind, TcpEnd, TerminalEnd
 from sim.transport.simulated_line import LINE_NAMES, PROMPT, delays_of
 
 Urls = AsyncIterator[Mapping[str, str]]
 Devices = Sequence[AmplifierDevice]
-Numbered = Mapping[int, AmplifierDevice]
 
 
 @dataclass(frozen=True)
@@ -108,108 +97,21 @@ def _default_line_kind(wire: SimulatedWire) -> str:
     return KIND_OF_PORT.get(port, FAR_ENDS[wire.kind].line_kind)
 
 
-@contextmanager
-def _on_bus(
-    make_adapter: Callable[[CanBus, SendBytes], FarEnd], speed: int | None, numbered: Numbered
-) -> Iterator[MakeEnd]:
-    """Amplifiers on a CAN bus behind an adapter."""
-    devices = [*numbered.values()]
-    with closing(CanBus(speed)) as bus, closing(BusNodes(bus, devices)):
-        yield partial(make_adapter, bus)
+_THIS_MODULE = "wire_assignment"
 
 
-def _on_serial_line(speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
-    return nullcontext(partial(SerialAmplifiers, numbered))
+def _far_ends() -> dict[str, FarEndKind]:
+    """Collect the kinds of far ends that the modules of this package declare."""
+    kinds: dict[str, FarEndKind] = {}
+    for name in {module.name for module in iter_modules(sim.far_ends.__path__)} - {_THIS_MODULE}:
+        module = import_module(f"sim.far_ends.{name}")
+        for value in vars(module).values():
+            if isinstance(value, FarEndKind):
+                kinds[value.name] = value
+    return dict(sorted(kinds.items()))
 
 
-def _on_modbus_tcp(speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
-    """Amplifiers whose units are shared by all connections."""
-    units = ModbusAmplifiers(numbered, lambda data: None, is_rtu=False)
-    return nullcontext(units.of_connection)
-
-
-def _on_modbus_rtu(speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
-    return nullcontext(partial(ModbusAmplifiers, numbered, is_rtu=True))
-
-
-@dataclass(frozen=True)
-class FarEndKind:
-    """Opens the far end of a kind of wire; also the form of its URLs.
-
-    url: with {host} for a TCP port; opens: what the host opens, as a page has it; speed: usual
-    speed [bit/s]; line_kind: of its line with several amplifiers; open_end: makes the far end of
-    amplifiers by address, at a speed; bits: of a byte on the line, with start, parity and stop, 0
-    if bytes take no time.
-    """
-
-    url: str
-    opens: str
-    speed: int
-    line_kind: str
-    open_end: Callable[[int | None, Numbered], AbstractContextManager[MakeEnd]]
-    bits: int = 0
-
-    @property
-    def scheme(self) -> str:
-        """The scheme of its URLs."""
-        return self.url.partition("://")[0]
-
-    @property
-    def is_ported(self) -> bool:
-        """Whether it is a TCP port."""
-        return "{host}" in self.url
-
-    @property
-    def is_can(self) -> bool:
-        """Whether it is a CAN bus."""
-        return self.url.startswith("can")
-
-    def url_of(self, *, port: int | str, speed: int, address: int) -> str:
-        """The URL of an amplifier, without options that have their default values."""
-        url = self.url.format(host=HOST, port=port, speed=speed, address=address)
-        url = url.removesuffix(f"&address={ADDRESS}")
-        return url.replace(f"{BUS_NAME}?bitrate={BITRATE}#", f"{BUS_NAME}#")
-
-
-FAR_ENDS: Mapping[str, FarEndKind] = {
-    "serial": FarEndKind(
-        "serial://{port}?baud={speed}&address={address}",
-        "a pseudo-terminal; `--shared` puts all amplifiers on one, at addresses 1, 2, ...",
-        BAUD,
-        "usb-high-speed",
-        _on_serial_line,
-        bits=10,
-    ),
-    "modbus-tcp": FarEndKind(
-        "modbus+tcp://{host}:{port}/{address}",
-        "a loopback port with a unit per amplifier; any free port if PORT is omitted",
-        RTU_BAUD,
-        "ethernet",
-        _on_modbus_tcp,
-    ),
-    "modbus-rtu": FarEndKind(
-        "modbus+rtu://{port}?baud={speed}#{address}",
-        "a pseudo-terminal with a unit per amplifier",
-        RTU_BAUD,
-        "usb-high-speed",
-        _on_modbus_rtu,
-        bits=11,
-    ),
-    "socketcand": FarEndKind(
-        f"can+socketcand://{{host}}:{{port}}/{BUS_NAME}?bitrate={{speed}}#{{address}}",
-        "a CAN bus behind a loopback port",
-        BITRATE,
-        "can",
-        partial(_on_bus, SocketcandClient),
-    ),
-    "slcan": FarEndKind(
-        "can+slcan://{port}?bitrate={speed}#{address}",
-        "a CAN bus behind a pseudo-terminal",
-        BITRATE,
-        "can-usb",
-        partial(_on_bus, SlcanAdapter),
-    ),
-}
+FAR_ENDS: Mapping[str, FarEndKind] = _far_ends()
 """By the names of `era sim --wire`."""
 _KIND_OF_SCHEME = {kind.scheme: name for name, kind in FAR_ENDS.items()}
 _EXAMPLE = ", such as --wire main=serial"
@@ -230,7 +132,7 @@ async def _open_line(wire: SimulatedWire, devices: Devices) -> Urls:
     faults = None
     if kind.is_can:  # frame faults are injected on the bus
         faults = Faults()
-    with kind.open_end(speed, numbered) as make_end:
+    with kind.serve(speed, numbered) as make_end:
         end: TcpEnd | TerminalEnd
         if kind.is_ported:
             end = TcpEnd(first, make_end, faults=faults, delays=delays, port=wire.port)

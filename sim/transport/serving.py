@@ -1,13 +1,19 @@
-"""Far ends in the running event loop, each behind a pseudo-terminal or a TCP port."""
+"""Far ends in the running event loop, each behind a pseudo-terminal or a TCP port.
+
+The module of each far end declares its kinds of wire (`FarEndKind`).
+"""
 
 import asyncio
 import math
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from typing import Self, TypeAlias, cast
 
 from drivers.errors import LinkError
+from drivers.urls import ADDRESS
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults import Faults
@@ -19,6 +25,8 @@ HOST = "127.0.0.1"
 _MAX_CONNECTIONS = 16
 _MAX_UNSENT = 16384  # bytes; then a client that does not read is disconnected
 
+Numbered: TypeAlias = Mapping[int, AmplifierDevice]
+"""Amplifiers by address."""
 MakeEnd: TypeAlias = Callable[[SendBytes], FarEnd]
 """Makes a far end from its function to send bytes."""
 
@@ -216,3 +224,46 @@ class _TcpClient(asyncio.Protocol):
             self.transport.close()
         elif self.transport.get_write_buffer_size() > _MAX_UNSENT:
             self.transport.abort()
+
+
+@dataclass(frozen=True)
+class FarEndKind:
+    """A kind of wire to simulated amplifiers; also the form of its URLs.
+
+    name: of `era sim --wire`; url: with {host} for a TCP port; opens: what the host opens, as a
+    page has it; speed: usual speed [bit/s]; line_kind: of its line with several amplifiers; end:
+    class of its far end, made of the amplifiers by address and the function to send bytes; bits: of
+    a byte on the line, with start, parity and stop, 0 if bytes take no time.
+    """
+
+    name: str
+    url: str
+    opens: str
+    speed: int
+    line_kind: str
+    end: Callable[..., FarEnd]
+    bits: int = 0
+
+    @property
+    def scheme(self) -> str:
+        """The scheme of its URLs."""
+        return self.url.partition("://")[0]
+
+    @property
+    def is_ported(self) -> bool:
+        """Whether it is a TCP port."""
+        return "{host}" in self.url
+
+    @property
+    def is_can(self) -> bool:
+        """Whether it is a CAN bus."""
+        return self.url.startswith("can")
+
+    def url_of(self, *, port: int | str, speed: int, address: int) -> str:
+        """The URL of an amplifier, without options that have their default values."""
+        url = self.url.format(host=HOST, port=port, speed=speed, address=address)
+        return url.removesuffix(f"&address={ADDRESS}")
+
+    def serve(self, speed: int | None, numbered: Numbered) -> AbstractContextManager[MakeEnd]:
+        """Serve amplifiers by address in a context, at a speed; yields how to make far ends."""
+        return nullcontext(partial(self.end, numbered))

@@ -66,7 +66,7 @@ def desk_plate(
     """
     import gc
 
-    from era_haptics.lab.measuring.desk import read_sensors
+    from era_haptics.lab.measuring.sensor_file import read_sensors
     from kit.desk_plate import MESH, Converters, draw_truth
     from kit.jack_client import jack_client
     from model.rig.rig_file import load_rig

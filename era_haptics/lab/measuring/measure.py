@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from era_haptics.lab.measuring.desk import Desk, converters, read_sensors
+from era_haptics.lab.measuring.desk import Desk, converter_response
 from era_haptics.lab.measuring.multisine import PERIOD, Multisine, estimate, multisine_frequencies
 from era_haptics.lab.measuring.recording_checks import (
     check_clocks,
@@ -25,6 +25,7 @@ from era_haptics.lab.measuring.recording_checks import (
     loopback_gain,
 )
 from era_haptics.lab.measuring.runs import TRIES, Run, play_and_record, run_time
+from era_haptics.lab.measuring.sensor_file import WiredSensor, read_sensors
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
@@ -47,7 +48,7 @@ class MeasuredResponses:
     - latency [s]: through the sound card.
     - even (sensors,): even harmonics, which indicate a square law.
     - repeated: number of runs repeated because of lost blocks.
-    - looped (f,): response of the loop-back.
+    - loopback (f,): response of the loop-back.
     """
 
     responses: Measurement
@@ -56,7 +57,7 @@ class MeasuredResponses:
     latency: float
     even: FloatArray
     repeated: int
-    looped: ComplexArray
+    loopback: ComplexArray
 
     def quality(self, sensor: int) -> dict[str, float]:
         """Return quality figures of the sensor with a given number, for JSON."""
@@ -82,14 +83,18 @@ def open_desk(
     level: None for 0.3, or less if the rig's limits require it; frequencies (f,) [Hz]: None for odd
     ones within the limits. Raises InputError, LinkError.
     """
-    level = min(_LEVEL, desk.highest) if level is None else level
-    desk.check(level)
+    if level is None:
+        level = min(_LEVEL, desk.max_level)
+    desk.check_level(level)
     if frequencies is None:
         limits = desk.rig.limits
         frequencies = multisine_frequencies(limits.frequency_min, limits.frequency_max)
     desk.check_frequencies(frequencies, what="--frequencies")
-    with closing(open_card(device, outputs=desk.output, inputs=desk.input, limit=level)) as card:
-        yield card, Multisine(frequencies, len(desk.sources), card.rate, level, seed)
+    wiring = desk.wiring
+    source_count = len(wiring.source_outputs)
+    outputs, inputs = wiring.loopback_output, wiring.loopback_input
+    with closing(open_card(device, outputs=outputs, inputs=inputs, limit=level)) as card:
+        yield card, Multisine(frequencies, source_count, card.rate, level, seed)
 
 
 def play_run(
@@ -107,19 +112,21 @@ def play_run(
     first_gain (f,): the loop-back's gain in the first run; None in the first run itself. Raises
     InputError, LinkError for inputs that are clipped or silent.
     """
+    wiring = desk.wiring
 
     def is_whole(recorded: FloatArray) -> bool:
         """Compare the loop-back, since drivers report false losses and miss real ones."""
-        check_levels(recorded, desk.named_inputs)
+        check_levels(recorded, wiring.input_names)
         if first_gain is not None:  # a block that was lost between two runs changes the delay
-            gain = loopback_gain(desk, multisine, number, recorded)
+            gain = loopback_gain(wiring, multisine, number, recorded)
             change = np.abs(gain - first_gain).max()
             if change > _MAX_CHANGE * np.abs(first_gain).max():
                 return False
-        return has_all_blocks(recorded[:, desk.input - 1], samples=multisine.samples)
+        loopback = recorded[:, wiring.loopback_input - 1]
+        return has_all_blocks(loopback, samples=multisine.samples)
 
     seconds = run_time(periods, settling=desk.settling)
-    signal = desk.on_outputs(multisine.signal(number, periods=seconds / PERIOD))
+    signal = wiring.on_outputs(multisine.signal(number, periods=seconds / PERIOD))
     return play_and_record(
         card,
         signal,
@@ -152,23 +159,28 @@ def measure(
     recorded = [run.recorded for run in runs]
     estimated = estimate(multisine, recorded)
     # A wrong loop-back signal, or another clock, looks like lost blocks; report the cause instead.
-    check_wiring(estimated, desk)
-    check_clocks(multisine, recorded, desk)
+    wiring = desk.wiring
+    check_wiring(estimated, wiring)
+    check_clocks(multisine, recorded, wiring)
     whole_runs = [run.whole for run in runs]
-    check_coherence(estimated, whole_runs, desk, is_heard=is_heard)
-    columns = desk.columns
-    looped = estimated.values[:, desk.input - 1, desk.looped]
-    era_responses = estimated.values[:, columns, : len(desk.eras)]
-    rms = np.sqrt((np.abs(era_responses) ** 2).mean(axis=(0, 2)))
+    check_coherence(estimated, whole_runs, wiring, is_heard=is_heard)
+    columns = wiring.sensor_columns
+    loopback = wiring.loopback_of(estimated.values)
+    era_responses = wiring.era_responses_of(estimated.values)
     return MeasuredResponses(
-        desk.responses(multisine.frequencies, estimated.values, looped),
-        estimated.coherence[:, columns],
-        estimated.std[:, columns] / rms,
-        latency(looped, multisine.frequencies),
-        estimated.even[columns],
-        sum(run.repeated for run in runs),
-        looped,
+        responses=desk.responses(multisine.frequencies, era_responses, loopback),
+        coherence=estimated.coherence[:, columns],
+        std=estimated.std[:, columns] / _rms_by_sensor(era_responses),
+        latency=latency(loopback, multisine.frequencies),
+        even=estimated.even[columns],
+        repeated=sum(run.repeated for run in runs),
+        loopback=loopback,
     )
+
+
+def _rms_by_sensor(values: ComplexArray) -> FloatArray:
+    """RMS over frequencies and ERAs of responses (f, sensors, ERAs), (sensors,)."""
+    return np.asarray(np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2))))
 
 
 def _play_runs(
@@ -184,7 +196,7 @@ def _play_runs(
         )
         runs.append(run)
         if first_gain is None:
-            first_gain = loopback_gain(desk, multisine, 0, run.recorded)
+            first_gain = loopback_gain(desk.wiring, multisine, 0, run.recorded)
         progress(len(runs), multisine.sources)
     return runs
 
@@ -278,37 +290,36 @@ def measure_through(
     for factor in (0.5, 1.0):
         scaled = replace(multisine, level=factor * multisine.level)
         run = play_run(
-            desk, card, scaled, _REPEATED_RUN, periods=periods, first_gain=measured.looped
+            desk, card, scaled, _REPEATED_RUN, periods=periods, first_gain=measured.loopback
         )
         repeats.append(_repeats(desk, measured, scaled, run.whole))
         progress(multisine.sources + len(repeats), total)
     half_level, at_end = repeats
-    # Responses with the usual reading error, in addition to the noise.
     responses = measured.responses
-    rms = np.sqrt((np.abs(responses.values) ** 2).mean(axis=(0, 2)))
-    noise = (measured.std * rms)[:, :, None] / np.sqrt(2)  # of each part
-    errors = np.hypot(responses.std, noise)
+    noise = measured.std * _rms_by_sensor(responses.values)
+    noise_of_parts = noise[:, :, None] / np.sqrt(2)  # of the real and of the imaginary part
+    errors = np.hypot(responses.std, noise_of_parts)  # with the usual reading error
     measurement = replace(responses, errors=errors, half_level=half_level, at_end=at_end)
+    sensors = enumerate(desk.sensors)
     return MeasuredPlate(
         measurement,
         multisine.level,
         time.monotonic() - started_at,
-        sensors=tuple(_sensor_rows(desk, measured)),
+        sensors=tuple(_sensor_row(sensor, measured.quality(n)) for n, sensor in sensors),
         notes=(),
         details={"latency_s": measured.latency, "repeated_runs": measured.repeated},
     )
 
 
-def _sensor_rows(desk: Desk, measured: MeasuredResponses) -> Iterator[dict[str, Any]]:
-    """Yield the sensors for JSON."""
-    for number, sensor in enumerate(desk.sensors):
-        yield {
-            "sensor": sensor.name,
-            "input": sensor.input,
-            "x_m": sensor.x,
-            "y_m": sensor.y,
-            "coherence_min": measured.quality(number)["coherence_min"],
-        }
+def _sensor_row(sensor: WiredSensor, quality: dict[str, float]) -> dict[str, Any]:
+    """Return a sensor for JSON."""
+    return {
+        "sensor": sensor.name,
+        "input": sensor.input,
+        "x_m": sensor.x,
+        "y_m": sensor.y,
+        "coherence_min": quality["coherence_min"],
+    }
 
 
 def _repeats(
@@ -319,9 +330,10 @@ def _repeats(
     bases = multisine.played(_REPEATED_RUN)[:, : len(full_levels)] * full_levels  # (f, eras)
     norms = np.linalg.norm(bases, axis=1, keepdims=True)
     expected = np.einsum("fse,fe->fs", measured.responses.values, bases) / norms
-    inputs = multisine.amplitudes_in(recorded)[:, desk.columns] / desk.sensitivities
-    repeated = inputs / converters(measured.looped)[:, None] / norms
-    names = ", ".join(name for name, _ in desk.eras)
+    samples = multisine.amplitudes_in(recorded)[:, desk.wiring.sensor_columns]
+    accelerations = samples / [sensor.sensitivity for sensor in desk.sensors]
+    repeated = accelerations / converter_response(measured.loopback)[:, None] / norms
+    names = ", ".join(desk.wiring.era_outputs)
     strongest = best_first(np.linalg.norm(expected, axis=1))[:_COMPARED_LINES]
     repeats = []
     for line in strongest:

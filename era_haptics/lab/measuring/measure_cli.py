@@ -97,9 +97,10 @@ def measure(
     --sensors have the same input, one sensor is moved from row to row, and the terminal prompts for
     each move. Use the file with era calibrate or era rig identify --measured.
     """
-    from era_haptics.lab.measuring.desk import Desk, are_positions, read_sensors
+    from era_haptics.lab.measuring.desk import Desk
     from era_haptics.lab.measuring.measure import measure_at_once, open_desk
     from era_haptics.lab.measuring.moved_sensor import measure_by_moving
+    from era_haptics.lab.measuring.sensor_file import are_positions, read_sensors
     from model.config.units import parse_frequencies
     from model.files.output_paths import check_ending, check_place
     from model.rig.rig_file import load_rig

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.desk import Desk, WiredSensor
+from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
 from era_haptics.lab.measuring.multisine import Multisine
+from era_haptics.lab.measuring.sensor_file import WiredSensor
 from era_haptics.lab.measuring.sound_card import DeviceLost, SoundCard
 from model.arrays import ComplexArray, FloatArray
 from model.commands.options import Stopwatch

@@ -233,8 +233,8 @@ def find_outputs(
     if output is not None:
         check_rig_output(output, rig_file)
     desk = Desk(rig, ())
-    desk.check(level)
-    count = count or desk.output - 1
+    desk.check_level(level)
+    count = count or max(desk.wiring.era_outputs.values())
     with closing(open_card(device, outputs=count, inputs=beside or 0, limit=level)) as card:
         if beside is None:
             findings = _requested(desk, card, count, level=level, frequency=frequency)
@@ -242,7 +242,7 @@ def find_outputs(
             findings = listen_to_outputs(
                 desk, card, beside, outputs=count, level=level, move=_prompt_to_move
             )
-    rig_channels = {name: number - 1 for name, number in desk.eras}
+    rig_channels = {name: number - 1 for name, number in desk.wiring.era_outputs.items()}
     channels = {finding.era: finding.output - 1 for finding in findings if finding.era}
     missing = [name for name in rig_channels if name not in channels]
     is_as_in_rig = channels == rig_channels
@@ -281,7 +281,7 @@ def _requested(
     desk: Desk, card: SoundCard, count: int, *, level: float, frequency: float | None
 ) -> list[OutputFinding]:
     """Ask on the terminal which actuator each output drives."""
-    names = {name.lower(): name for name, _ in desk.eras}  # not assigned yet
+    names = {name.lower(): name for name in desk.wiring.era_outputs}  # not assigned yet
     findings = []
     for number in range(1, count + 1):
         played = tone(desk, number, outputs=count, rate=card.rate, level=level, frequency=frequency)

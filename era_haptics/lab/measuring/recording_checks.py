@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.multisine import PERIOD, Multisine, ResponseEstimate
+from era_haptics.lab.measuring.wiring import SoundCardWiring
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 
@@ -127,25 +127,25 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
         raise LinkError(f"silent: {inputs}; check cables, amplifier and sensor supply (IEPE)")
 
 
-def check_wiring(estimate: ResponseEstimate, desk: Desk) -> None:
+def check_wiring(estimate: ResponseEstimate, wiring: SoundCardWiring) -> None:
     """Raise InputError unless the loop-back, and no sensor, is connected to an output by a cable.
 
     A cable returns a single output. With a single source, sensors do so too.
     """
     gains = np.median(np.abs(estimate.values), axis=0)  # (inputs, sources)
-    cables = _cables(gains, desk)
-    _check_loopback(gains, cables, desk)
-    for sensor in desk.sensors:
+    cables = _cables(gains, wiring)
+    _check_loopback(gains, cables, wiring)
+    for sensor in wiring.sensors:
         source = cables[sensor.input - 1]
         if source >= 0:
             raise InputError(
-                f"input {sensor.input} must have {desk.named_inputs[sensor.input]}, got output "
-                f"{desk.sources[source]} as through a cable; check the plug of that sensor, Y "
-                "cables and monitoring of the sound card"
+                f"input {sensor.input} must have {wiring.input_names[sensor.input]}, got output "
+                f"{wiring.source_outputs[source]} as through a cable; check the plug of that "
+                "sensor, Y cables and monitoring of the sound card"
             )
 
 
-def _cables(gains: FloatArray, desk: Desk) -> NDArray[np.intp]:
+def _cables(gains: FloatArray, wiring: SoundCardWiring) -> NDArray[np.intp]:
     """Return the source connected to each input by a cable, (inputs,), -1 for none.
 
     gains: (inputs, sources).
@@ -153,27 +153,31 @@ def _cables(gains: FloatArray, desk: Desk) -> NDArray[np.intp]:
     highest = gains.max(axis=1)
     second = np.sort(gains, axis=1)[:, :-1].max(axis=1, initial=0.0)
     numbers = np.arange(1, 1 + len(gains))
-    is_distinguishable = (len(desk.sources) > 1) | (numbers == desk.input)
+    is_distinguishable = (len(wiring.source_outputs) > 1) | (numbers == wiring.loopback_input)
     is_cable = (highest > _LOOPED) & (second < CROSSTALK * highest) & is_distinguishable
     return np.where(is_cable, gains.argmax(axis=1), -1)
 
 
-def _check_loopback(gains: FloatArray, cables: NDArray[np.intp], desk: Desk) -> None:
+def _check_loopback(gains: FloatArray, cables: NDArray[np.intp], wiring: SoundCardWiring) -> None:
     """Raise InputError unless the loop-back's input has its output alone."""
-    source, number = desk.looped, desk.input
+    source = wiring.loopback_source
+    number = wiring.loopback_input
+    output = wiring.loopback_output
     own_gains = gains[number - 1]
     other_gains = own_gains * (np.arange(gains.shape[1]) != source)
-    of_eras = [f"output {output} of ERA {name}" for name, output in desk.eras]
-    other = f"{other_gains.max():.2g} of {of_eras[other_gains.argmax()]}"
-    required = f"input {number} must bring back output {desk.output} alone, as the loop-back, got"
+    era_names = list(wiring.era_outputs)
+    strongest = int(other_gains.argmax())
+    strongest_output = f"output {wiring.source_outputs[strongest]} of ERA {era_names[strongest]}"
+    other = f"{other_gains.max():.2g} of {strongest_output}"
+    required = f"input {number} must bring back output {output} alone, as the loop-back, got"
     if cables[number - 1] not in (source, -1):
         raise InputError(f"{required} {other}: outputs are swapped; exchange their cables")
     looped_inputs = np.flatnonzero(cables == source) + 1
     if looped_inputs.size and number not in looped_inputs:
         first = looped_inputs[0]
         raise InputError(
-            f"the loop-back of output {desk.output} must come back at input {number}, got it at "
-            f"input {first}, {desk.named_inputs.get(first, 'of no sensor')}: inputs are swapped; "
+            f"the loop-back of output {output} must come back at input {number}, got it at input "
+            f"{first}, {wiring.input_names.get(first, 'of no sensor')}: inputs are swapped; "
             "exchange their cables"
         )
     gain = own_gains[source]
@@ -183,10 +187,12 @@ def _check_loopback(gains: FloatArray, cables: NDArray[np.intp], desk: Desk) -> 
         raise InputError(f"{required} {other}, too; check mixers and monitoring of the sound card")
 
 
-def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
+def check_clocks(
+    multisine: Multisine, recorded: Sequence[FloatArray], wiring: SoundCardWiring
+) -> None:
     """Raise InputError for inputs on another clock than the outputs; recorded: runs (n, inputs)."""
     drifts = []
-    for number, name in desk.named_inputs.items():
+    for number, name in wiring.input_names.items():
         drift = certain_drift(multisine, [run[:, number - 1] for run in recorded])
         if drift:
             drifts.append(f"{1e6 * drift:.0f} ppm at {name} (input {number})")
@@ -200,7 +206,7 @@ def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Des
 def check_coherence(
     estimate: ResponseEstimate,
     recorded: Sequence[FloatArray],
-    desk: Desk,
+    wiring: SoundCardWiring,
     *,
     is_heard: bool = False,
 ) -> None:
@@ -209,11 +215,11 @@ def check_coherence(
     estimate: from recorded, runs of (n, inputs); is_heard: whether every ERA was detected at
     another position.
     """
-    coherences = np.median(estimate.coherence[:, desk.columns], axis=0)
-    peaks = np.max([np.abs(run[:, desk.columns]).max(axis=0) for run in recorded], axis=0)
+    coherences = np.median(estimate.coherence[:, wiring.sensor_columns], axis=0)
+    peaks = np.max([np.abs(run[:, wiring.sensor_columns]).max(axis=0) for run in recorded], axis=0)
     faint: list[str] = []
     disturbed: list[str] = []
-    for sensor, coherence, peak in zip(desk.sensors, coherences, peaks, strict=True):
+    for sensor, coherence, peak in zip(wiring.sensors, coherences, peaks, strict=True):
         if coherence < _COHERENT:
             rows = faint if peak < _FAINT else disturbed
             level = f"input up to {100 * peak:.2g} % of full scale"
@@ -227,15 +233,15 @@ def check_coherence(
                 f"coherence must be at least {_COHERENT:g} in the median, got "
                 f"{', '.join(sensors)}; {remedy}"
             )
-    _check_moved(estimate, desk, is_heard=is_heard)
+    _check_moved(estimate, wiring, is_heard=is_heard)
 
 
-def _check_moved(estimate: ResponseEstimate, desk: Desk, *, is_heard: bool) -> None:
+def _check_moved(estimate: ResponseEstimate, wiring: SoundCardWiring, *, is_heard: bool) -> None:
     """Raise LinkError for an ERA that moves no sensor."""
-    values = np.abs(estimate.values[:, desk.columns])
-    ratios = values / estimate.std[:, desk.columns, None]
+    values = np.abs(estimate.values[:, wiring.sensor_columns])
+    ratios = values / estimate.std[:, wiring.sensor_columns, None]
     ratio_by_source = np.median(ratios, axis=0).max(axis=0)
-    for (name, output), ratio in zip(desk.eras, ratio_by_source, strict=False):
+    for (name, output), ratio in zip(wiring.era_outputs.items(), ratio_by_source, strict=False):
         if ratio >= _MOVED:
             continue
         if is_heard:
@@ -251,8 +257,8 @@ def _check_moved(estimate: ResponseEstimate, desk: Desk, *, is_heard: bool) -> N
 
 
 def loopback_gain(
-    desk: Desk, multisine: Multisine, number: int, recorded: FloatArray
+    wiring: SoundCardWiring, multisine: Multisine, number: int, recorded: FloatArray
 ) -> ComplexArray:
     """Complex gain (f,) of the cable in whole periods of a run (n, inputs)."""
-    amplitudes = multisine.played(number)[:, desk.looped]
-    return np.asarray(multisine.amplitudes_in(recorded[:, desk.input - 1]) / amplitudes)
+    amplitudes = multisine.played(number)[:, wiring.loopback_source]
+    return np.asarray(multisine.amplitudes_in(recorded[:, wiring.loopback_input - 1]) / amplitudes)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.desk import MIN_SETTLING
 from era_haptics.lab.measuring.multisine import PERIOD, Multisine
+from era_haptics.lab.measuring.settling import MIN_SETTLING
 from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import FloatArray
 from model.errors import InputError

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from era_haptics.lab.measuring.desk import Desk, are_positions
+from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.multisine import multisine_frequencies
+from era_haptics.lab.measuring.sensor_file import are_positions
 from model.arrays import FloatArray
 from model.estimate.measurement import Measurement, write_responses
 from model.quantities import counted

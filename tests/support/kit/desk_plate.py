@@ -31,7 +31,8 @@ import numpy as np
 from scipy import linalg, signal
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.desk import Desk, WiredSensor, are_positions
+from era_haptics.lab.measuring.desk import Desk
+from era_haptics.lab.measuring.sensor_file import WiredSensor, are_positions
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
@@ -490,16 +491,17 @@ class DeskPlate:
         is_shared: bool = False,
     ) -> None:
         self._truth, self._rate = truth, rate
-        desk = Desk(truth.rig, tuple(sensors), is_shared)
-        self._columns = [output - 1 for _, output in desk.eras]
-        self._looped, self.outputs = desk.sources[-1] - 1, desk.output
+        wiring = Desk(truth.rig, tuple(sensors), is_shared).wiring
+        self._columns = [output - 1 for output in wiring.era_outputs.values()]
+        self._looped = wiring.source_outputs[-1] - 1
+        self.outputs = wiring.loopback_output
         self._model = DeskModel(truth, np.array([[sensor.x, sensor.y] for sensor in sensors]))
         self._sensors = tuple(sensors)
         self._fingers: tuple[FingertipLoad, ...] = ()
         self._place = 0 if are_positions(sensors) else None
         self._channels = SensorChannels(
             sensors if self._place is None else sensors[:1],
-            loopback=desk.input,
+            loopback=wiring.loopback_input,
             converters=converters,
             rate=rate,
             seed=seed,

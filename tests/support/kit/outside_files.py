@@ -27,7 +27,7 @@ from era_haptics.lab.design.problem import (
     contact_rule,
     layouts_of,
 )
-from era_haptics.lab.measuring.desk import read_sensors
+from era_haptics.lab.measuring.sensor_file import read_sensors
 from kit.plates import small_table
 from model.config.document import parse_document
 from model.errors import InputError

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from era_haptics.lab.measuring.desk import WiredSensor, read_sensors
+from era_haptics.lab.measuring.sensor_file import WiredSensor, read_sensors
 from model.arrays import ComplexArray, FloatArray
 from model.estimate.measurement import Measurement
 from model.reduction.free_plate import FreePlate, solve_free_plate

@@ -14,7 +14,7 @@ import pytest
 from drivers.errors import LinkError
 from era_haptics.command import run_era
 from era_haptics.lab.measuring import simulated_measurement
-from era_haptics.lab.measuring.desk import Desk, WiredSensor
+from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
 from era_haptics.lab.measuring.multisine import (
     Multisine,
@@ -24,6 +24,7 @@ from era_haptics.lab.measuring.multisine import (
 )
 from era_haptics.lab.measuring.recording_checks import check_wiring
 from era_haptics.lab.measuring.runs import play_and_record
+from era_haptics.lab.measuring.sensor_file import WiredSensor
 from era_haptics.lab.measuring.sound_card import SoundCard
 from examples.make_measured import Accelerometer, record_responses
 from kit.desk_plate import Converters, DeskModel, DeskPlate, Truth
@@ -96,7 +97,7 @@ def card(truth: Truth, *, noise: float = 0.0, is_shared: bool = False, **wires: 
 
 def sines(desk: Desk, frequencies: np.ndarray = PLAYED_HZ) -> Multisine:
     """Multisines of all ERAs and of the loop-back."""
-    return Multisine(frequencies, len(desk.eras) + 1, RATE, LEVEL)
+    return Multisine(frequencies, len(desk.rig.eras) + 1, RATE, LEVEL)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +166,7 @@ def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
     found = measure(desk, sound, sines)
     difference = found.responses.values - undisturbed.responses.values
     assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
-    assert (sound.runs, desk.output) == (4, 4)
+    assert (sound.runs, desk.wiring.loopback_output) == (4, 4)
     assert found.latency * RATE == pytest.approx(DELAY, abs=1)
     for wires, cause in (
         ({"on_inputs": [0, 3, 2, 1], "on_outputs": [0, 1, 2, 3, 3]}, "at input 2.*P2"),
@@ -268,7 +269,7 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
     each = np.broadcast_to(came, (len(PLAYED_HZ), *came.shape)).astype(complex)
     found = ResponseEstimate(each, abs(each), abs(each), np.zeros(4))
     with nullcontext() if cause is None else pytest.raises(InputError, match=cause):
-        check_wiring(found, Desk(rig, SENSORS))
+        check_wiring(found, Desk(rig, SENSORS).wiring)
 
 
 def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
@@ -284,7 +285,7 @@ def test_levels_and_frequencies_that_cannot_be_played_are_refused(rig: Rig) -> N
     """A level beyond the rig's limits; half a hertz, no line of a second; 4 kHz at 8 kHz."""
     for level in (0.0, 1.5):
         with pytest.raises(InputError, match="--level"):
-            Desk(rig, SENSORS).check(level)
+            Desk(rig, SENSORS).check_level(level)
     for frequency in (61.5, 3999.0):
         with pytest.raises(InputError, match="frequencies"):
             Multisine(np.array([frequency]), 5, RATE, LEVEL)

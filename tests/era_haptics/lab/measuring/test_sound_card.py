@@ -20,9 +20,10 @@ import pytest
 
 from drivers.errors import LinkError
 from era_haptics.command import run_era
-from era_haptics.lab.measuring.desk import Desk, WiredSensor, read_sensors
+from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.measure import measure_through
 from era_haptics.lab.measuring.multisine import Multisine
+from era_haptics.lab.measuring.sensor_file import WiredSensor, read_sensors
 from era_haptics.lab.measuring.sound_card import DeviceLost
 from kit.desk_plate import (
     Converters,
@@ -162,7 +163,7 @@ def measured(
     plate = DeskPlate(truth, SENSORS, rate=CARD_RATE, converters=converters, seed=1)
     card = DeskCard(plate, rate=CARD_RATE, **wires)  # type: ignore[arg-type]
     desk = Desk(rig, SENSORS)
-    multisine = Multisine(frequencies, len(desk.eras) + 1, CARD_RATE, LEVEL)
+    multisine = Multisine(frequencies, len(rig.eras) + 1, CARD_RATE, LEVEL)
     return measure_through(desk, card, multisine, periods=2, progress=lambda done, of: None)
 
 

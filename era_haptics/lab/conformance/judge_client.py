@@ -75,12 +75,11 @@ class JudgeClient(ABC):
     - reply_words: longest reply to each message by message number, if known.
     - quiet: time within which a reply arrives [s]. timeout: how long a reply is awaited [s].
     - wire_time: time on the wire for a request and a reply, from their word counts [s]. transit:
-      wire time of the longest reply. pace: upper bound of the fraction of wire_time that the line
-      really takes (a terminal has no bit times).
+      wire time of the longest reply.
     - loss: why the line was lost. last_bytes: received since the last request.
     - neighbors: other addresses that reply. free_address: the highest address without a reply.
       Both are set by `look_around`.
-    - fastest: shortest exchange by message name [s]. lateness: of this machine and of replies.
+    - lateness: of this machine and of replies.
     """
 
     kind: ClassVar[str]
@@ -110,12 +109,10 @@ class JudgeClient(ABC):
         self.timeout = JUDGE_REPLY_TIMEOUT
         self.wire_time: Callable[[int, int], float] = lambda words, reply_words: 0.0
         self.transit = 0.0
-        self.pace = 1.0
         self.loss: str | None = None
         self.last_bytes = b""
         self.neighbors: frozenset[int] = frozenset()
         self.free_address = 0
-        self.fastest: dict[str, float] = {}
         self.lateness = Lateness()
         self._heard_addresses: set[int] = set()
         self._news = asyncio.Event()

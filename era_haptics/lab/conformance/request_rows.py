@@ -1,4 +1,4 @@
-"""Rows of a check: requests with their allowed outcomes, layers to play, and pauses."""
+"""Rows of a check: requests with their allowed outcomes, layers to play, and waits."""
 
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
@@ -29,10 +29,19 @@ class Send:
     channels: tuple[int | None, ...]
 
 
-Row: TypeAlias = "LayerSet | Send | float | Callable[[], Awaitable[object]] | Sequence[Row]"
-"""A layer to play, a request, a pause [s] with a fed watchdog, an awaitable, or a sequence.
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Wait for a time [s] with a fed watchdog."""
 
-A sequence of rows starts at rest and armed, and is followed until all outputs have settled.
+    duration: float
+
+
+Step: TypeAlias = LayerSet | Send | Wait | Callable[[], Awaitable[object] | None]
+"""A layer to play, a request, a wait, or a function to call and await."""
+Row: TypeAlias = "Step | Sequence[Row]"
+"""A step, or a sequence of rows.
+
+A sequence starts at rest and armed, and is followed until all outputs have settled.
 """
 RequestRows: TypeAlias = Sequence[Row]
 

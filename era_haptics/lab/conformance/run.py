@@ -172,7 +172,7 @@ class ConformanceRun:
         if self._subject is not None:
             self._subject.is_at_rest = False
             if is_violation and not check.greets:
-                outcome.last_set = set_text(self._subject.sent_set)
+                outcome.last_set = set_text(self._subject.sets.sent)
         if check.greets and type(outcome) is CheckOutcome:
             return CheckAttempt(outcome, "")
         failure = await self._leave(check)
@@ -182,7 +182,7 @@ class ConformanceRun:
 
     async def _carry_out(self, check: ConformanceCheck, subject: Subject) -> None:
         """Carry out the steps of a check; a check that drives channels starts at rest."""
-        subject.sent_set = []
+        subject.sets.sent = []
         if not check.drives:
             await subject.watch()
         else:

@@ -9,20 +9,17 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
-from drivers.protocol.definition import QUANTITIES, REACTION, has_feature
+from drivers.protocol.definition import QUANTITIES, has_feature
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.capabilities import Capabilities
+from era_haptics.lab.conformance.exchange_timing import SLOWEST, ExchangeTiming
 from era_haptics.lab.conformance.judge_client import JudgeClient
 from era_haptics.lab.conformance.outcomes import require
 from era_haptics.lab.conformance.request_rows import FULL, Send, layer, play_now
 
-READ_REQUESTS = ("GetCaps", "GetStatus", "GetFaults")
-"""Messages that only read: on Modbus each takes half an exchange."""
 _DEFAULT_FREQUENCY = QUANTITIES["frequency"].to_wire(110.0)
 _OFFSET = 800  # steps of frequency between the usual and the second one
 _PHASE, _ENVELOPE_STEP = QUANTITIES["phase"], QUANTITIES["envelope_step"]
-_PROMPT = 0.02  # s, exchange time of a fast line
-_SLOWEST = 0.1  # s, longest exchange time that makes times longer
 # s; lead of a Commit before its moment, in addition to the exchanges; largest lateness allowed for
 _LEAD, _MAX_LATENESS = 0.0025, 0.02
 
@@ -30,12 +27,14 @@ _LEAD, _MAX_LATENESS = 0.0025, 0.02
 class Stimuli:
     """Stimuli for the amplifier behind a client.
 
-    can: its capabilities. max_level: upper bound for driven channels, relative to full level.
+    can: its capabilities. timing: of its exchanges. max_level: upper bound for driven channels,
+    relative to full level.
     """
 
     def __init__(self, client: JudgeClient, can: Capabilities, max_level: float) -> None:
         self.client = client
         self.can = can
+        self.timing = ExchangeTiming(client)
         self.channels = range(can["channels"])
         self._max_level = max_level
 
@@ -195,58 +194,33 @@ class Stimuli:
 
     # Times that are long compared with an exchange
 
-    @property
-    def exchange_time(self) -> float:
-        """Shortest exchange [s] of the slowest message so far, or the allowed time if shorter.
-
-        The bound keeps a slow amplifier from extending its own deadlines. An unknown delay of the
-        line shows in a reading.
-        """
-        count = self.client.transactions
-        read_time = self.read_time
-        times = [time for name, time in self.client.fastest.items() if name not in READ_REQUESTS]
-        slowest = max(times, default=read_time)
-        allowed = count * REACTION + max(self.client.transit, count * read_time)
-        return min(slowest, allowed)
-
-    @property
-    def read_time(self) -> float:
-        """The shortest exchange [s] so far of a message that only reads."""
-        times = [time for name, time in self.client.fastest.items() if name in READ_REQUESTS]
-        return min(times, default=math.inf)
-
-    @property
-    def slowness(self) -> float:
-        """Factor for times, compared with a line with exchanges of 20 ms or less."""
-        return max(min(self.exchange_time, _SLOWEST) / _PROMPT, 1.0)
-
     def scaled(self, milliseconds: int) -> int:
         """Return a time [ms] that is as long for this line as the given one for a quick line."""
-        return math.ceil(milliseconds * self.slowness)
+        return math.ceil(milliseconds * self.timing.slowness)
 
     @property
     def shortest_watchdog(self) -> int:
         """The shortest watchdog time [ms], or that in which it can be fed on a slow line."""
-        feeding_time = math.ceil(8_000 * min(self.exchange_time, _SLOWEST))
+        feeding_time = math.ceil(8_000 * min(self.timing.exchange_time, SLOWEST))
         shortest = max(self.can["watchdog_min"], feeding_time)
         return int(min(shortest, self.can["watchdog_max"]))
 
     @property
     def ramp(self) -> int:
         """A ramp [ms] that is long against an exchange."""
-        required = max(100, math.ceil(6_000 * min(self.exchange_time, 0.1)))
+        required = max(100, math.ceil(6_000 * min(self.timing.exchange_time, 0.1)))
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
         """Raise NotApplicable unless a ramp can last for `duration` [s], or for a few exchanges."""
-        duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
+        duration = max(duration, 0.03 + 2 * min(self.timing.exchange_time, 1.0))
         is_long_enough = self.can["ramp_max"] >= 1000 * duration
         require(is_long_enough, f"ramp_max is shorter than {duration:.2g} s")
 
     @property
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
-        exchange_time = min(max(self.exchange_time, self.client.transit / 2), 1.3)
+        exchange_time = min(max(self.timing.exchange_time, self.client.transit / 2), 1.3)
         duration = max(0.2, 12 * exchange_time)
         step_max = _ENVELOPE_STEP.from_wire(self.can["envelope_step_max"])
         self.require_knots()
@@ -258,7 +232,7 @@ class Stimuli:
     @property
     def short_onset(self) -> Envelope:
         """An onset with one knot, shorter than the long one where the line is quick enough."""
-        return self.envelope(0.05, 1.0) if self.slowness == 1 else self.long_onset
+        return self.envelope(0.05, 1.0) if self.timing.slowness == 1 else self.long_onset
 
     def lead(self, count: int, duration: float) -> float:
         """Return how long before their moments [s] Commits are sent; `duration` [s]: of all.
@@ -267,5 +241,5 @@ class Stimuli:
         machine that was late once leaves no amplifier without a verdict.
         """
         lateness = min(self.client.lateness.largest, _MAX_LATENESS)
-        shortest = 2.5 * self.exchange_time + _LEAD
+        shortest = 2.5 * self.timing.exchange_time + _LEAD
         return max(shortest, min(shortest + lateness, duration / count))

@@ -67,7 +67,7 @@ async def numbers(subject: Subject) -> None:
     number after 0.1 s of silence.
     """
     client = cast(CanClient, subject.client)
-    is_fast = subject.exchange_time <= _FAST
+    is_fast = subject.timing.exchange_time <= _FAST
     require(is_fast, "the line is too slow to observe how long a number is kept")
     await subject.arm()
     client.quiet = _FAST
@@ -138,7 +138,7 @@ async def _expect_abandoned(subject: Subject, client: CanClient) -> None:
 
 async def _expect_padding_ignored(subject: Subject, client: CanClient) -> None:
     """Require that bytes after the words of a message are ignored."""
-    commit = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
+    commit = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.sets.token}))
     for number, message, words in ((9, _STATUS, []), (10, _COMMIT, commit)):
         *frames, last = segments(number, message, words)
         padded = last[:4] + b"\xff" * 4
@@ -305,7 +305,8 @@ async def network_management(subject: Subject) -> None:
         ("reset_communication", None, None),
     ):
         stopped = partial(_expect_stop, subject, client, command, to, started_as)
-        await subject.run([subject.arm, subject.layer_0(), subject.starve, stopped, subject.clear])
+        starve = subject.feeding.starve
+        await subject.run([subject.arm, subject.layer_0(), starve, stopped, subject.clear])
     start = partial(client.command, "start")
     start_all = partial(client.command, "start", to=for_all)
     end_another = partial(client.command, "pre_operational", to=client.free_address)
@@ -374,7 +375,7 @@ async def heartbeats(subject: Subject) -> None:
     for interval in (stated_interval, _INTERVAL, 0, stated_interval):
         await _expect_heartbeats(client, interval)
     client.frames.clear()
-    await subject.run([partial(subject.arm, 0.0), subject.starve, subject.settle])
+    await subject.run([partial(subject.arm, 0.0), subject.feeding.starve, subject.settle])
     watchdog = CANOPEN["emergencies"]["WATCHDOG"]
     fault = FAULTS["WATCHDOG"] << 4
     tripped = []
@@ -425,7 +426,7 @@ async def emergencies(subject: Subject) -> None:
 
     Send emergencies in PRE-OPERATIONAL as well; only messages and Events stop there.
     """
-    is_quick = subject.exchange_time <= _QUICK
+    is_quick = subject.timing.exchange_time <= _QUICK
     require(is_quick, "the line is too slow to send an NMT command within the 5 ms of a fault")
     await subject.in_time(partial(_expect_emergencies, subject))
 
@@ -433,7 +434,7 @@ async def emergencies(subject: Subject) -> None:
 async def _expect_emergencies(subject: Subject) -> None:
     """Take it out of operation during the fade of a fault, between two emergencies."""
     client = cast(CanClient, subject.client)
-    await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.starve])
+    await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.feeding.starve])
     client.frames.clear()
     due = threads.now() + subject.judge.watchdog + _SETTLING
     while threads.now() < due:

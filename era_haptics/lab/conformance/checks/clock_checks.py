@@ -12,6 +12,7 @@ from drivers.protocol.definition import (
     REACTION,
 )
 from era_haptics.lab.conformance.check import driving, reading
+from era_haptics.lab.conformance.judged_exchange import RATE_STEP
 from era_haptics.lab.conformance.outcomes import (
     ContractViolation,
     UntimedClock,
@@ -24,10 +25,11 @@ from era_haptics.lab.conformance.request_rows import (
     SILENCE_NOW,
     STOP_NOW,
     RequestRows,
+    Wait,
     commit,
     send,
 )
-from era_haptics.lab.conformance.subject import RATE_STEP, Subject
+from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expectations.tolerances import DRIFT, Interval
 from registry import threads
 
@@ -117,9 +119,9 @@ async def clock_rate(subject: Subject) -> None:
     _require_clock(subject)
     await subject.request("GetStatus")  # whose duration determines how soon a rate shows
     visible_change = _HIGHEST * RATE_STEP - DRIFT
-    duration = max(0.35, 1.5 * subject.read_time / visible_change)
+    duration = max(0.35, 1.5 * subject.timing.read_time / visible_change)
     require(duration <= _MAX_DURATION, "the line is too slow to observe the rate")
-    layer_time = _LAYER_TIME if subject.exchange_time <= _QUICK else duration / 2
+    layer_time = _LAYER_TIME if subject.timing.exchange_time <= _QUICK else duration / 2
     timed = subject.layer_0(valid_for=round(1000 * layer_time), ramp=subject.ramp)
     fast, slow = (send("Ping", rate=rate) for rate in (_HIGHEST, _LOWEST))
     read = partial(_expect_rate, subject, duration)
@@ -133,8 +135,8 @@ async def clock_rate(subject: Subject) -> None:
     stops: RequestRows = [fast, STOP_NOW, slow, read, subject.clear]
     disarm = send("Disarm", ramp=subject.ramp)
     disarms: RequestRows = [fast, disarm, slow, subject.settle, slow, read]
-    watchdog_time = subject.shortest_watchdog / 1000
-    trips: RequestRows = [fast, subject.starve, watchdog_time, subject.settle, slow, read]
+    until_trip = Wait(subject.shortest_watchdog / 1000)
+    trips: RequestRows = [fast, subject.feeding.starve, until_trip, subject.settle, slow, read]
     await subject.run([subject.arm, fast, *keeps_rate, slow, read, *stops])
     await subject.run([subject.arm, subject.layer_0(), *disarms])
     await subject.run([partial(subject.arm, 0.0), *trips])
@@ -145,8 +147,8 @@ async def _expect_rate(subject: Subject, duration: float) -> None:
     end = threads.now() + duration
     while threads.now() < end:
         row = send("GetStatus")
-        if subject.is_hungry:  # a Commit feeds, and leaves the rate as it is
-            row = commit(subject.token)
+        if subject.feeding.is_due:  # a Commit feeds, and leaves the rate as it is
+            row = commit(subject.sets.token)
         await subject.run([row])
         await asyncio.sleep(_SPACING / 2)
     await subject.request("GetStatus")
@@ -164,7 +166,7 @@ async def mark(subject: Subject) -> None:
     client = subject.client
     if client.has_broadcasts:
         await client.look_around()
-    await subject.run([subject.arm, send("Mark"), send("Mark"), 0.1])
+    await subject.run([subject.arm, send("Mark"), send("Mark"), Wait(0.1)])
     if client.has_broadcasts and not client.neighbors:
         sent_at = threads.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))

@@ -3,7 +3,7 @@
 from drivers.protocol.definition import MESSAGES
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import verify
-from era_haptics.lab.conformance.request_rows import layer
+from era_haptics.lab.conformance.request_rows import Wait, layer
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
@@ -62,4 +62,4 @@ async def doubled_frames(subject: Subject) -> None:
         subject.played(part, sent_at)
     for frame, pause in ((quiet_frame, 0.0), (loud_frame, 0.25), (loud_frame, 0.0)):
         await client.reply_to(frame)
-        await subject.run([subject.ping, pause])
+        await subject.run([subject.ping, Wait(pause)])

@@ -11,6 +11,7 @@ from era_haptics.lab.conformance.request_rows import (
     SILENCE_NOW,
     RequestRows,
     Row,
+    Wait,
     commit,
     layer,
     play_now,
@@ -49,7 +50,7 @@ def layers_play_on(subject: Subject) -> RequestRows:
     first = subject.layer_0(level=0.75, ramp=ramp, valid_for=ramp + 100)
     loud = subject.separate_layer(1, 0.25)
     quiet = subject.separate_layer(1, 0.125)
-    return [(first, 0.02, loud, quiet, loud)]
+    return [(first, Wait(0.02), loud, quiet, loud)]
 
 
 @driving("protocol.md#layers")
@@ -61,7 +62,7 @@ def valid_for(subject: Subject) -> RequestRows:
     """
     ramp = min(100, subject.ramp_max)
     short = subject.scaled(100)
-    pause = 0.12 * subject.slowness
+    pause = 0.12 * subject.timing.slowness
     half = subject.layer_0(level=0.5, valid_for=short)
     endless_half = subject.layer_0(level=0.5)
     lasting = layer(1, subject.separate_tone(1, 0.25), valid_for=60_000)
@@ -75,9 +76,9 @@ def valid_for(subject: Subject) -> RequestRows:
             partial(subject.follow, 2 * pause),
             half,
             endless_half,
-            pause,
+            Wait(pause),
         ],
-        [subject.layer_0(valid_for=_BIT_15 + short), 2 * pause],
+        [subject.layer_0(valid_for=_BIT_15 + short), Wait(2 * pause)],
     ]
 
 
@@ -94,11 +95,12 @@ def renew(subject: Subject) -> RequestRows:
     second = subject.separate_layer(1, 0.25)
     timed = layer(3, subject.separate_tone(3, 0.25), valid_for=scaled(120))
     earlier_end = layer(0, renew=True, valid_for=scaled(100))
+    past_end = Wait(0.15 * subject.timing.slowness)
     return [
-        (fading, second, 0.05, layer(0, renew=True, valid_for=scaled(200))),
+        (fading, second, Wait(0.05), layer(0, renew=True, valid_for=scaled(200))),
         (turned, layer(0, renew=True), send("GetAchieved", layer=0)),
         (layer(2, renew=True, valid_for=scaled(100)), second),
-        (timed, layer(3, renew=True), send("GetAchieved", layer=3), 0.15 * subject.slowness),
+        (timed, layer(3, renew=True), send("GetAchieved", layer=3), past_end),
         (subject.layer_0(valid_for=0), earlier_end),
         (subject.layer_0(valid_for=scaled(400)), earlier_end),
     ]
@@ -137,12 +139,12 @@ async def _read_achieved(subject: Subject) -> None:
     require_in_time(is_waiting, "the onset may have ended")
 
 
-def _until_onset_end(subject: Subject, sets: int) -> float:
-    """Return how long after so many sets [s] the long onset of the first is over."""
+def _until_onset_end(subject: Subject, sets: int) -> Wait:
+    """Wait, after so many sets, until the long onset of the first is over."""
     onset = subject.long_onset
     step = onset.step / QUANTITIES["envelope_step"].per_unit
     duration = step * (len(onset.knots) + 1)
-    return max(duration + 0.02 - sets * subject.exchange_time, 0.0)
+    return Wait(max(duration + 0.02 - sets * subject.timing.exchange_time, 0.0))
 
 
 @driving("protocol.md#layers")
@@ -175,7 +177,7 @@ def _two_onsets(subject: Subject, waiting: LayerSet) -> list[Row]:
 
     On an amplifier with one channel there is one onset only.
     """
-    step = min(max(0.02, 2 * subject.exchange_time), 0.1)
+    step = min(max(0.02, 2 * subject.timing.exchange_time), 0.1)
     long_onset, short_onset = subject.long_onset, subject.envelope(step, 0.5)
     last = len(subject.channels) - 1
     first_is_long = [
@@ -234,6 +236,6 @@ def _ending_with_its_onset(subject: Subject, waiting: LayerSet) -> list[Row]:
     """
     onset = subject.envelope(_QUARTER, *[1.0] * 3)
     has_onset = onset.step == 625 and len(onset.knots) == 3
-    if not has_onset or subject.slowness != 1:
+    if not has_onset or subject.timing.slowness != 1:
         return []
     return [(subject.layer_0(subject.tone(0, 0.5, onset=onset), valid_for=250), waiting)]

@@ -25,7 +25,7 @@ from era_haptics.lab.conformance.outcomes import (
     require_in_time,
     verify,
 )
-from era_haptics.lab.conformance.request_rows import DISARM_NOW, STOP_NOW, send, stage
+from era_haptics.lab.conformance.request_rows import DISARM_NOW, STOP_NOW, Wait, send, stage
 from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
@@ -57,7 +57,7 @@ async def events(subject: Subject) -> None:
     arm = MESSAGES["Arm"].number
     expected_types = [EVENT, arm] if has_events else [arm]
     expect_equal(types, expected_types, "message types after Arm (Event, then reply)")
-    await subject.run([subject.layer_0(), subject.starve])
+    await subject.run([subject.layer_0(), subject.feeding.starve])
     await _expect_unrequested_event(subject, has_events=has_events)
     await subject.run(
         [
@@ -70,7 +70,7 @@ async def events(subject: Subject) -> None:
             STOP_NOW,
             STOP_NOW,
             subject.clear,
-            0.02,
+            Wait(0.02),
         ]
     )
     messages = [message for message in client.history if message.type & _TYPE == EVENT]
@@ -147,25 +147,25 @@ async def broadcasts(subject: Subject) -> None:
     serial_number = str(subject.identity["serial_number"])
     await _expect_ignored(subject, session=next_session, serial_number=serial_number[:-1])
     half_level = stage(subject.layer_0(level=0.5))
-    await subject.run([subject.arm, subject.layer_0(), half_level, _UNFED])
+    await subject.run([subject.arm, subject.layer_0(), half_level, Wait(_UNFED)])
     await _expect_ignored(subject)
-    moment = subject.moment(0.1 * subject.slowness)
-    commit = partial(_expect_obeyed, subject, "Commit", token=subject.token, at=moment)
-    await subject.run([commit, subject.follow, commit, subject.starve])
+    moment = subject.moment(0.1 * subject.timing.slowness)
+    commit = partial(_expect_obeyed, subject, "Commit", token=subject.sets.token, at=moment)
+    await subject.run([commit, subject.follow, commit, subject.feeding.starve])
     half_frames = []
     if client.kind != "rtu":
         # Half of a message, on CAN one frame of two, must not disturb the next one.
         frame = client.request(MESSAGES["Commit"].number, valid_words("Commit"), to=0)
         half_frames = [frame[: len(frame) // 2]]
     await _expect_obeyed(subject, "Stop", *half_frames, ramp=subject.ramp)
-    await subject.run([subject.settle, 0.02])
+    await subject.run([subject.settle, Wait(0.02)])
     await _expect_ignored(subject, session=subject.next_session)
 
 
 async def _expect_ignored(subject: Subject, **values: object) -> None:
     """Broadcast unicast messages and flawed messages: the amplifier must ignore them."""
     client = subject.client
-    (part,) = subject.parts(subject.layer_0(level=0.75), token=subject.token + 2)
+    (part,) = subject.sets.parts(subject.layer_0(level=0.75), token=subject.sets.token + 2)
     values = {
         "session": subject.session,
         "latch": subject.latch,
@@ -177,7 +177,7 @@ async def _expect_ignored(subject: Subject, **values: object) -> None:
     }
     stop, commit = MESSAGES["Stop"].number, MESSAGES["Commit"].number
     requests: list[tuple[int, list[int]]] = [
-        (commit, valid_words("Commit", session=77, token=subject.token or 1)),
+        (commit, valid_words("Commit", session=77, token=subject.sets.token or 1)),
         (stop, []),
         (stop, [0, 0]),
         (UNKNOWN_NUMBERS[0], []),

@@ -128,7 +128,7 @@ async def present_areas(subject: Subject) -> None:
     await subject.run([half_level, partial(subject.request, "GetStatus")])
     same_area = await reply_areas.read(_PING)
     expect_equal(same_area, area, "reply area of Ping, read again after a Set")
-    part, *_ = subject.parts(subject.layer_0(), now=0, count=3)
+    part, *_ = subject.sets.parts(subject.layer_0(), now=0, count=3)
     await subject.send(send("Set", **part))
     tag = client.number
     area = await reply_areas.read(_SET)
@@ -142,7 +142,7 @@ async def present_areas(subject: Subject) -> None:
 async def _expect_no_unit_0(subject: Subject, client: ModbusClient) -> None:
     """Require that Modbus TCP has no broadcasts."""
     await subject.run([stage(subject.layer_0())])
-    words = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
+    words = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.sets.token}))
     await client.expect_silence(client.request(_COMMIT, words, to=0), "a Commit to unit 0")
     await subject.request("GetStatus")
 
@@ -152,7 +152,7 @@ async def _expect_no_area_of_broadcasts(subject: Subject, client: ModbusClient) 
     subject.require_alone()
     ping = client.adu(client.write_of(_PING, [subject.session, 0], tag=_TAG), unit=0)
     await client.expect_silence(ping, "a broadcast Ping")
-    await subject.starve()
+    subject.feeding.starve()
     stop = client.adu(client.write_of(_STOP, [0], tag=_TAG), unit=0)
     await client.send(stop)
     (tag,) = await client.read(BOX * _STOP + REPLY_OFFSET, 1)

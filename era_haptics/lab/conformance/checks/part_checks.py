@@ -15,6 +15,7 @@ from era_haptics.lab.conformance.request_rows import (
     RequestRows,
     Row,
     Send,
+    Wait,
     commit,
     layer,
     play_now,
@@ -34,7 +35,7 @@ _MANY_ON_MODBUS = 9  # parts; each has a response, and all must arrive before th
 def long_set(subject: Subject) -> list[LayerSet]:
     """Make a set of several parts; a short set on a slow line, so that it does not expire in
     transit."""
-    is_quick = max(subject.client.transit, subject.exchange_time) < _SLOW
+    is_quick = max(subject.client.transit, subject.timing.exchange_time) < _SLOW
     max_words = _LONG if is_quick else _SHORT
     return _set_of(subject, min(subject.can["set_words"], max_words))
 
@@ -74,13 +75,13 @@ def _layer_count(subject: Subject, room: int) -> int:
 
 
 def _require_quick(subject: Subject) -> None:
-    is_quick = 16 * subject.exchange_time <= STAGED_LIFE
+    is_quick = 16 * subject.timing.exchange_time <= STAGED_LIFE
     require(is_quick, "the line is too slow for a set of several parts")
 
 
 def _cut(subject: Subject, *layers: LayerSet, token: int, now: int = 0) -> list[Send]:
     """Cut a set into three parts or more."""
-    set_parts = subject.parts(*layers, token=token, now=now, count=3)
+    set_parts = subject.sets.parts(*layers, token=token, now=now, count=3)
     return [send("Set", **part) for part in set_parts]
 
 
@@ -102,7 +103,7 @@ def parts_of_sets(subject: Subject) -> RequestRows:
     silent_layers = [layer(number) for number in subject.layers[1:]]
     rows: list[Row] = [subject.arm, playing]
     rows += _staged_in_any_order(_cut(subject, *layers, token=2))
-    rows += [play_now(playing, *silent_layers, token=3), 0.05]
+    rows += [play_now(playing, *silent_layers, token=3), Wait(0.05)]
     rows += _played_in_any_order(_cut(subject, *layers, token=4, now=1))
     together = _cut(subject, *layers, token=6)
     rows += [play_now(playing, token=5), partial(subject.send_all, together), commit(6)]
@@ -122,14 +123,14 @@ def _staged_in_any_order(set_parts: Sequence[Send]) -> list[Row]:
     for part in (*reversed(middle), middle[-1]):
         rows += [part, incomplete, last]
     rows += [first, incomplete, last, last]
-    rows += [first, middle[0], last, commit(token), last, 0.05]
+    rows += [first, middle[0], last, commit(token), last, Wait(0.05)]
     return rows
 
 
 def _played_in_any_order(set_parts: Sequence[Send]) -> list[Row]:
     """Return the parts of a set that plays immediately, the last one too early, and repeated."""
     first, *middle, last = set_parts
-    return [first, last, *middle, last, last, 0.05]
+    return [first, last, *middle, last, last, Wait(0.05)]
 
 
 @driving("protocol.md#parts-of-a-set")
@@ -242,7 +243,7 @@ def empty_sets(subject: Subject) -> RequestRows:
     count = _MANY_ON_MODBUS if is_on_modbus else _MANY
     many_parts = [empty_part(token=5, index=index, parts=count) for index in range(count)]
     rows: list[Row] = [subject.arm, playing, empty_set, commit(2)]
-    rows += [_with(empty_set, token=3, now=1), 0.1]
+    rows += [_with(empty_set, token=3, now=1), Wait(0.1)]
     rows.append(empty_part(index=0, parts=4))
     rows.append(_with(part, index=1, parts=4, stream=pack_layers([half])))
     rows.append(empty_part(index=2, parts=4))
@@ -285,7 +286,7 @@ class ExpiringSet:
         subject = self._subject
         status = await subject.status()
         age = status.when.latest - self._began
-        await subject.pause(max(1.03 * STAGED_LIFE - age, 0.0))
+        await subject.wait(max(1.03 * STAGED_LIFE - age, 0.0))
         await subject.status()
         subject.judge.sets.has_expired = False  # it must have
 
@@ -298,11 +299,11 @@ def sets_expire(subject: Subject) -> RequestRows:
     """
     _require_quick(subject)
     first, *middle, last = _cut(subject, *long_set(subject), token=3)
-    pause = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1)
+    pause = Wait(0.45 * STAGED_LIFE - 3.5 * min(subject.timing.exchange_time, 0.1))
     expiring = ExpiringSet(subject)
     rows: list[Row] = [subject.arm, subject.layer_0(), partial(expiring.start, first), pause]
     # Another confirmation does not extend the life of a set.
     rows += [*middle, last, pause, last, expiring.outlive, commit(3, "BAD_TOKEN"), last]
     rows += [partial(expiring.start, middle[0]), *middle[1:]]
-    rows += [0.55 * STAGED_LIFE, first, expiring.outlive, last]
+    rows += [Wait(0.55 * STAGED_LIFE), first, expiring.outlive, last]
     return rows

@@ -66,7 +66,7 @@ async def obeys_in_time(subject: Subject) -> None:
         "Arm": partial(subject.request, "Arm", watchdog=watchdog),
         "Ping": subject.ping,
         "Set": partial(subject.send, stage(subject.layer_0())),
-        "Commit": lambda: subject.request("Commit", token=subject.token),
+        "Commit": lambda: subject.request("Commit", token=subject.sets.token),
         "GetAchieved": partial(subject.request, "GetAchieved", layer=0),
         "Silence": partial(subject.request, "Silence", ramp=0),
         "Disarm": partial(subject.request, "Disarm", ramp=0),

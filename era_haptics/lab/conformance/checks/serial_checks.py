@@ -66,11 +66,11 @@ async def discarded_frames(subject: Subject) -> None:
     _, words = subject.words_of(subject.layer_0())
     reply = await client.exchange(_SET, words, extra=_HALF_WORD)
     expect_equal(reply.code, "BAD_LENGTH", "code for a Set with half a word")
-    part = [subject.session, subject.token + 1, 2 << 1]
+    part = [subject.session, subject.sets.token + 1, 2 << 1]
     data = client.request(_SET, part, extra=_HALF_WORD)
     await client.expect_silence(data, "a part with half a word")
     await subject.run([stage(subject.layer_0(level=0.5))])
-    for name, values in (("Commit", {"token": subject.token}), ("Stop", {"ramp": 0})):
+    for name, values in (("Commit", {"token": subject.sets.token}), ("Stop", {"ramp": 0})):
         message = MESSAGES[name]
         words = message.request.pack(subject.filled(values))
         for version in (VERSION - 1, 0):

@@ -26,6 +26,7 @@ from era_haptics.lab.conformance.request_rows import (
     STOP_NOW,
     RequestRows,
     Row,
+    Wait,
     commit,
     layer,
     play_now,
@@ -74,7 +75,7 @@ def repeats_change_nothing(subject: Subject) -> RequestRows:
     """
     timed = subject.layer_0(valid_for=300)
     repetitions = [commit(1), play_now(timed, token=1)]
-    return [subject.arm, stage(timed), commit(1), 0.2, *repetitions, 0.13, *repetitions]
+    return [subject.arm, stage(timed), commit(1), Wait(0.2), *repetitions, Wait(0.13), *repetitions]
 
 
 @driving("protocol.md#sets")
@@ -132,8 +133,8 @@ async def starts_at_its_moment(subject: Subject) -> None:
     Compare the high word of the clock modulo 65536, and start with the first sample at or behind
     the moment.
     """
-    soon = min(0.1 * subject.slowness, 0.4)
-    beyond = 1.01 * MAX_AHEAD + 2 * min(subject.exchange_time, 1.0)
+    soon = min(0.1 * subject.timing.slowness, 0.4)
+    beyond = 1.01 * MAX_AHEAD + 2 * min(subject.timing.exchange_time, 1.0)
     for duration in (soon, 0.99 * MAX_AHEAD, beyond, -0.1, 0.0):
         await subject.in_time(partial(_expect_start, subject, duration))
     # Shift the clock so that it wraps before the moment.
@@ -154,7 +155,7 @@ async def _expect_start(subject: Subject, duration: float, *, shift: int = 0) ->
     await subject.request("Ping", rate=_SLOWEST if is_long else 0)
     await subject.run([play_now(content, token=1), commit(1)])
     starts_at = committed_at + (duration if is_ahead else 0.0)
-    await subject.pause(max(starts_at - _AROUND - threads.now(), 0.0))
+    await subject.wait(max(starts_at - _AROUND - threads.now(), 0.0))
     has_clock = subject.can["clock_error"] != CLOCK_UNKNOWN
     while threads.now() < starts_at + _AROUND:
         status = await subject.status()
@@ -187,7 +188,7 @@ def what_waits_for_its_moment(subject: Subject) -> RequestRows:
     Before a newer Commit or `now` that you accept, start the set that waits. Drop it in Silence,
     Stop, Disarm, faults and an Arm with a new session.
     """
-    lead = min(0.1 * subject.slowness, 0.4)
+    lead = min(0.1 * subject.timing.slowness, 0.4)
     waiting = stage(subject.layer_0(level=0.25))
     past_moment = partial(subject.past_moment, _SETTLING)
     courses: list[Row] = []
@@ -196,14 +197,14 @@ def what_waits_for_its_moment(subject: Subject) -> RequestRows:
         courses.append([waiting, partial(subject.commit_in, time), *rows, past_moment])
     trip: list[Row] = [
         send("Arm", watchdog=subject.shortest_watchdog),
-        subject.starve,
+        subject.feeding.starve,
         subject.settle,
     ]
     late_moment = partial(subject.commit_in, min(3 * lead, 0.45))
     courses.append([waiting, late_moment, *trip, past_moment])
     # No status is read as it starts; its end counts from there.
     timed = subject.layer_0(ramp=subject.ramp, valid_for=subject.scaled(100))
-    courses.append([stage(timed), partial(subject.commit_in, lead), 1.25 * lead])
+    courses.append([stage(timed), partial(subject.commit_in, lead), Wait(1.25 * lead)])
     return courses
 
 
@@ -211,7 +212,7 @@ def _rows_before_the_moment(subject: Subject, lead: float) -> list[list[Row]]:
     """Return rows that start a waiting set, drop it or leave it; lead: until its moment [s]."""
     half = subject.separate_layer(1, 0.5)
     same_layer = subject.layer_0(level=0.5)
-    part, *_ = subject.parts(half, token=2, now=0, count=3)
+    part, *_ = subject.sets.parts(half, token=2, now=0, count=3)
     rejected_set = play_now(layer(0, after=True), token=3, code="BAD_VALUE")
     return [
         [SILENCE_NOW],

@@ -11,6 +11,7 @@ from era_haptics.lab.conformance.request_rows import (
     STOP_NOW,
     RequestRows,
     Row,
+    Wait,
     commit,
     layer,
     play_now,
@@ -21,6 +22,16 @@ from era_haptics.lab.conformance.subject import Subject
 
 _WATCHDOG, _MAX_RAMP = QUANTITIES["watchdog"], QUANTITIES["ramp"].maximum
 _SESSION = 0x1234  # held while requests with other sessions are sent
+_NEXT_SESSION = 0x1235
+_OTHER_SESSIONS = (
+    _NEXT_SESSION,
+    0x5634,  # another high byte
+    0x1256,  # another low byte
+    0xEDCB,  # all bits inverted
+    1,
+)
+_NEW_SESSION = _SESSION ^ 0x100  # another high byte
+_OLDER_SESSION = _SESSION - 7
 
 
 @driving("protocol.md#states")
@@ -96,21 +107,20 @@ def sessions(subject: Subject) -> RequestRows:
     Compare all 16 bits of the session, right after the state. Remember the last session after
     Disarm, Stop and faults, and reject an Arm that repeats it.
     """
-    subject.client.session = _SESSION - 1
     watchdog_max = subject.can["watchdog_max"]
     playing = subject.layer_0()
     quiet = subject.layer_0(level=0.25)
     arm_again = send("Arm", watchdog=watchdog_max, session=_SESSION, code="WRONG_SESSION")
     arm_after_stop = send("Arm", watchdog=watchdog_max, code="WRONG_SESSION")
-    rows: list[Row] = [subject.arm, playing, stage(playing)]
-    for other_session in (0x1235, 0x5634, 0x1256, 0xEDCB, 1):
+    rows: list[Row] = [partial(subject.arm, session=_SESSION), playing, stage(playing)]
+    for other_session in _OTHER_SESSIONS:
         rows.append(partial(_expect_wrong_session, subject, other_session))
     rows += [send("Ping", session=0, code="BAD_VALUE"), DISARM_NOW, subject.settle]
-    rows += [play_now(quiet, session=0x1235, code="WRONG_STATE"), arm_again]
-    rows.append(partial(_arm_as, subject, _SESSION ^ 0x100))
+    rows += [play_now(quiet, session=_NEXT_SESSION, code="WRONG_STATE"), arm_again]
+    rows += [partial(subject.arm, session=_NEW_SESSION), subject.status]
     rows.append(play_now(quiet, session=_SESSION, code="WRONG_SESSION"))
     rows += [STOP_NOW, subject.settle, subject.clear, arm_after_stop]
-    rows.append(partial(_arm_as, subject, _SESSION - 7))
+    rows.append(partial(subject.arm, session=_OLDER_SESSION))
     return rows
 
 
@@ -128,12 +138,6 @@ async def _expect_wrong_session(subject: Subject, session: int) -> None:
         wrong("Arm", watchdog=_WATCHDOG.maximum),
     ]
     await subject.send_all(rows)
-
-
-async def _arm_as(subject: Subject, session: int) -> None:
-    """Arm with a session."""
-    subject.client.session = session - 1
-    await subject.arm()
 
 
 @driving("protocol.md#states")
@@ -164,7 +168,8 @@ def stop(subject: Subject) -> RequestRows:
     staged = stage(subject.layer_0(level=0.5))
     before_stop: list[Row] = [subject.arm, subject.all_channels(), staged]
     while_latched = rows_while_latched(subject)
-    return [*before_stop, STOP_NOW, 0.02, *while_latched, commit(2, "WRONG_STATE"), 0.1]
+    commit_staged = commit(2, "WRONG_STATE")
+    return [*before_stop, STOP_NOW, Wait(0.02), *while_latched, commit_staged, Wait(0.1)]
 
 
 @driving("protocol.md#states")
@@ -175,19 +180,19 @@ def stop_ramps(subject: Subject) -> RequestRows:
     as ramp_max, and keep the earlier of two ends.
     """
     playing = subject.all_channels()
-    during_fade = partial(subject.follow, 0.2 * subject.slowness)
-    part, *_ = subject.parts(subject.layer_0(), token=2, now=0, count=3)
-    stop = send("Stop", ramp=subject.ramp)
+    during_fade = partial(subject.follow, 0.2 * subject.timing.slowness)
+    part, *_ = subject.sets.parts(subject.layer_0(), token=2, now=0, count=3)
+    slow_stop = send("Stop", ramp=subject.ramp)
     slowest_stop = send("Stop", ramp=0xFFFF)
     disarm = send("Disarm", ramp=subject.ramp)
     slowest_disarm = send("Disarm", ramp=0xFFFF)
     too_slow_stop = send("Stop", ramp=min(2 * subject.ramp_max, 0xFFFF))
     while_disarmed = _rows_while_disarmed(subject, 0xFFFF)
     return [
-        (playing, send("Set", **part), stop),
+        (playing, send("Set", **part), slow_stop),
         (playing, disarm),
         (playing, slowest_stop, during_fade, disarm),
-        (playing, slowest_disarm, *while_disarmed, subject.clear, during_fade, stop),
+        (playing, slowest_disarm, *while_disarmed, subject.clear, during_fade, slow_stop),
         (playing, too_slow_stop),
     ]
 
@@ -205,7 +210,7 @@ def silence_never_later(subject: Subject) -> RequestRows:
     courses: list[Row] = [(playing, slow_stop, quick_stop), (playing, quick_stop, slow_stop)]
     courses.append((subject.layer_0(), layer(0, ramp=50), slow_stop))
     # The remaining time of a fade counts, not its duration.
-    courses.append((playing, send("Stop", ramp=300), 0.2, send("Stop", ramp=150)))
+    courses.append((playing, send("Stop", ramp=300), Wait(0.2), send("Stop", ramp=150)))
     return courses
 
 
@@ -216,8 +221,8 @@ def stop_ends_all(subject: Subject) -> RequestRows:
     Fade every voice of every layer, released or not, skip endings, and drop what waits.
     """
     subject.require_ramp()
-    stop = send("Stop", ramp=10)
-    return [(*rows, stop) for rows in subject.transitions(subject.ramp_max)]
+    quick_stop = send("Stop", ramp=10)
+    return [(*rows, quick_stop) for rows in subject.transitions(subject.ramp_max)]
 
 
 @driving("protocol.md#states")
@@ -246,7 +251,7 @@ def clear_too_early(subject: Subject) -> RequestRows:
     subject.require_ramp()
     ramp = subject.ramp
     last_channel = layer(0, subject.tone(subject.channels[-1]))
-    after_fade = ramp / 1000 + 0.02
+    after_fade = Wait(ramp / 1000 + 0.02)
     return [
         subject.arm,
         last_channel,
@@ -272,7 +277,7 @@ def silence(subject: Subject) -> RequestRows:
         layer(2, subject.tone(second_channel, 0.1)),
     )
     content = subject.layer_0()
-    first_part, *_, last_part = subject.parts(content, token=4, now=0, count=3)
+    first_part, *_, last_part = subject.sets.parts(content, token=4, now=0, count=3)
     rows: list[Row] = [subject.arm, playing, stage(content)]
     rows += [send("Silence", ramp=subject.ramp), subject.follow, commit(2, "BAD_TOKEN")]
     rows += [content, send("Set", **first_part), SILENCE_NOW, send("Set", **last_part)]

@@ -9,9 +9,11 @@ from drivers.protocol.sets import Command, Envelope
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import expect_equal, require
 from era_haptics.lab.conformance.request_rows import (
+    FULL,
     SILENCE_NOW,
     RequestRows,
     Row,
+    Wait,
     layer,
     play_now,
 )
@@ -25,6 +27,7 @@ _OTHER_SETS = 8  # sets during the first fade, in addition to fades and moments
 _SHARES = 0.41, 0.1, 0.06  # test-level fractions of the voices that are cut short
 _REMAINING = 0.0035, 0.0008  # s; remaining time of a fade that counts, and too short to count
 _PEAK_TIME = 0.15  # s; a sum reaches its peak within this time
+_UNTIL_PEAK = Wait(_PEAK_TIME)
 
 
 @driving("protocol.md#the-clock")
@@ -35,7 +38,7 @@ async def phases(subject: Subject) -> None:
     commit, and do not accumulate rounded steps.
     """
     await subject.arm()
-    await subject.require_interference()
+    await _require_interference(subject)
     first = layer(0, *(subject.tone(channel, 0.5, 30.0) for channel in subject.channels))
     for number in subject.layers[1:]:
         angle = 30.0 + 40.0 * number
@@ -48,6 +51,20 @@ async def phases(subject: Subject) -> None:
     await subject.in_time(partial(_expect_cancellation, subject))
 
 
+async def _require_interference(subject: Subject) -> None:
+    """Raise NotApplicable unless levels show that tones at the same frequency cancel."""
+    opposite_tones = [
+        layer(number, subject.tone(0, 0.5, phase)) for number, phase in enumerate((0.0, 180.0))
+    ]
+    await subject.play(*opposite_tones)
+    level = (await subject.request("GetStatus"))["levels"][0]
+    await subject.play(layer(0), layer(1))
+    shows_interference = level <= 0.75 * subject.level * FULL  # phases may be rounded
+    reason = "the levels do not show that tones at the same frequency interfere"
+    require(shows_interference, reason)
+    subject.judge.outputs.interferes = True
+
+
 async def _expect_same_sum(subject: Subject, phase: float, time: float) -> None:
     """Play two slow tones a time [s] apart, the first renewed, then again, that time later."""
     await subject.arm()
@@ -56,7 +73,8 @@ async def _expect_same_sum(subject: Subject, phase: float, time: float) -> None:
     first = layer(0, subject.tone(0, 0.5, 0.0, frequency=frequency))
     second = layer(1, subject.tone(0, 0.5, phase, frequency=frequency))
     renewed = layer(0, renew=True)
-    await subject.run([first, time, renewed, second, time, first, time, subject.status])
+    wait = Wait(time)
+    await subject.run([first, wait, renewed, second, wait, first, wait, subject.status])
 
 
 async def _expect_cancellation(subject: Subject) -> None:
@@ -69,7 +87,7 @@ async def _expect_cancellation(subject: Subject) -> None:
     frequency = subject.close_frequency(1) | 1
     tone = layer(0, subject.tone(0, 0.5, 0.0, frequency=frequency))
     opposite = layer(1, subject.tone(0, 0.5, 180.0, frequency=frequency))
-    await subject.run([tone, _LONG, opposite, subject.status])
+    await subject.run([tone, Wait(_LONG), opposite, subject.status])
 
 
 @driving("protocol.md#voices")
@@ -119,7 +137,7 @@ class VoicePlan:
         self._pause = 0.004 + self._jump.step / 10_000  # s; until a tone is at its level
         self._quiet = (1 - sum(_SHARES)) / (self.count + 2)  # share of the other voices
         ramp_max = subject.ramp_max
-        duration = self._sets() * (subject.exchange_time + self._pause)
+        duration = self._sets() * (subject.timing.exchange_time + self._pause)
         self._lead = subject.lead(_MOMENTS, ramp_max / 1000 - duration)
         duration += _MOMENTS * self._lead
         subject.require_ramp(duration)
@@ -208,7 +226,7 @@ async def limited(subject: Subject) -> None:
     above = layer(1, subject.tone(frequency=subject.second_frequency))
     at_full_level = layer(1, subject.tone(last, 1.0 / subject.level - 1.0))
     just_above = layer(1, subject.tone(last, 1.01 / subject.level - 1.0))
-    sums: list[Row] = [_PEAK_TIME, above, _PEAK_TIME, layer(1), at_full_level, _PEAK_TIME]
+    sums: list[Row] = [_UNTIL_PEAK, above, _UNTIL_PEAK, layer(1), at_full_level, _UNTIL_PEAK]
     await subject.run(
         [
             subject.arm,
@@ -216,13 +234,13 @@ async def limited(subject: Subject) -> None:
             at_full_level,
             *sums,
             just_above,
-            _PEAK_TIME,
+            _UNTIL_PEAK,
             *sums,
         ]
     )
     await _expect_unseen_limit(subject, "Ping")
     opposite = layer(1, subject.tone(0, 1.0, 180.0))
-    await subject.run([layer(1), play_now(subject.layer_0(), opposite), _PEAK_TIME])
+    await subject.run([layer(1), play_now(subject.layer_0(), opposite), _UNTIL_PEAK])
     status = await subject.request("GetStatus")
     is_limited = has_flag(status.values, "limited")
     expect_equal(is_limited, False, "flag limited for tones that cancel")

@@ -6,7 +6,14 @@ from functools import partial
 
 from drivers.protocol.sets import Envelope
 from era_haptics.lab.conformance.check import driving
-from era_haptics.lab.conformance.request_rows import SILENCE_NOW, RequestRows, Row, layer, send
+from era_haptics.lab.conformance.request_rows import (
+    SILENCE_NOW,
+    RequestRows,
+    Row,
+    Wait,
+    layer,
+    send,
+)
 from era_haptics.lab.conformance.subject import Subject
 
 _STEPS_PER_MS = 10  # of an envelope's step
@@ -38,7 +45,7 @@ def cross_fades(subject: Subject) -> RequestRows:
     change.
     """
     ramp = subject.ramp
-    during_ramp = 0.4 * ramp / 1000
+    during_ramp = Wait(0.4 * ramp / 1000)
     half = subject.layer_0(level=0.5)
     other_loud = layer(0, subject.tone(frequency=subject.second_frequency), ramp=ramp)
     other_half = layer(0, subject.tone(0, 0.5, frequency=subject.second_frequency), ramp=ramp)
@@ -60,7 +67,7 @@ def kept_phase(subject: Subject) -> RequestRows:
     a new one.
     """
     ramp = subject.ramp
-    during_ramp = 0.4 * ramp / 1000
+    during_ramp = Wait(0.4 * ramp / 1000)
     half = subject.layer_0(level=0.5)
     knots = min(1, subject.can["knots"])
     onset = subject.envelope(0.1, *[0.25] * knots)
@@ -80,7 +87,7 @@ def kept_phase(subject: Subject) -> RequestRows:
     ended = subject.layer_0(subject.tone(0, 0.5, ending=ending))
     courses.append((half, other_layer))
     courses.append((half, layer(0, ramp=ramp), during_ramp, continued))
-    courses.append((ended, layer(0), 0.02, continued))
+    courses.append((ended, layer(0), Wait(0.02), continued))
     return courses
 
 
@@ -93,7 +100,7 @@ def onsets(subject: Subject) -> RequestRows:
     """
     subject.require_knots()
     ramp = subject.ramp
-    during_ramp = 0.4 * ramp / 1000
+    during_ramp = Wait(0.4 * ramp / 1000)
     courses: list[Row] = []
     for amplitudes in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], []):
         onset = subject.envelope(0.04, *amplitudes)
@@ -146,24 +153,25 @@ def endings_amid(subject: Subject) -> RequestRows:
     not prolong it.
     """
     subject.require_knots()
-    exchange_time = min(subject.exchange_time, 0.1)
-    knots = 1 if subject.slowness == 1 else math.ceil(exchange_time / 0.01)
+    exchange_time = min(subject.timing.exchange_time, 0.1)
+    knots = 1 if subject.timing.slowness == 1 else math.ceil(exchange_time / 0.01)
     onset = subject.envelope(0.1, *[1.0] * knots)
     ending = subject.envelope(0.05, *[0.25] * knots)
-    during_onset = _middle(onset, knots)
-    during_ending = _middle(ending, knots)
+    onset_middle = _middle(onset, knots)
+    during_onset = Wait(onset_middle)
+    during_ending = Wait(_middle(ending, knots))
     to_zero = layer(0, subject.tone(0, 0.0, onset=onset))  # a voice until its onset has ended
     to_zero_ending = layer(0, subject.tone(0, 0.0, onset=onset, ending=ending))
-    timed = replace(to_zero_ending, valid_for=round(1000 * during_onset))
+    timed = replace(to_zero_ending, valid_for=round(1000 * onset_middle))
     with_ending = subject.layer_0(subject.tone(ending=ending))
     continued = subject.layer_0(subject.tone(keep=True), ramp=subject.ramp + 75)
     slow_silence = send("Silence", ramp=min(500, subject.ramp_max))
     return [
         (to_zero_ending, during_onset, layer(0)),
-        (to_zero_ending, _end(onset, knots), layer(0)),
+        (to_zero_ending, _past_end(onset, knots), layer(0)),
         (timed,),
         (with_ending, layer(0), during_ending, layer(0)),
-        (with_ending, layer(0), _end(ending, knots), layer(0)),
+        (with_ending, layer(0), _past_end(ending, knots), layer(0)),
         (to_zero, during_onset, continued),
         (with_ending, layer(0), during_ending, slow_silence),
         (to_zero, during_onset, slow_silence),
@@ -175,9 +183,9 @@ def _middle(envelope: Envelope, knots: int) -> float:
     return knots * envelope.step / _STEPS_PER_MS / 2000
 
 
-def _end(envelope: Envelope, knots: int) -> float:
-    """Return a time [s] after the end of an envelope with this number of knots."""
-    return (knots + 1) * envelope.step / _STEPS_PER_MS / 1000 + 0.02
+def _past_end(envelope: Envelope, knots: int) -> Wait:
+    """Wait until the end of an envelope with this number of knots."""
+    return Wait((knots + 1) * envelope.step / _STEPS_PER_MS / 1000 + 0.02)
 
 
 @driving("protocol.md#ramps-and-envelopes")

@@ -15,6 +15,7 @@ from era_haptics.lab.conformance.request_rows import (
     STOP_NOW,
     RequestRows,
     Row,
+    Wait,
     commit,
     layer,
     play_now,
@@ -51,9 +52,9 @@ async def watchdog_ranges(subject: Subject) -> None:
 
 async def _trip(subject: Subject, time: float, *sets: Row) -> None:
     """Arm with a watchdog [s], play sets, and let it trip: a fault, and silence 5 ms later."""
-    arm = partial(subject.arm, time)
-    faults = send("GetFaults")
-    await subject.run([arm, *sets, subject.starve, 0.8 * time, subject.settle, faults])
+    starve = subject.feeding.starve
+    await subject.run([partial(subject.arm, time), *sets, starve, Wait(0.8 * time)])
+    await subject.run([subject.settle, send("GetFaults")])
 
 
 @driving("protocol.md#sessions-and-the-watchdog")
@@ -74,7 +75,7 @@ async def _trip_and_clear(subject: Subject, time: int) -> None:
     await subject.run(
         [
             *rows_while_latched(subject),
-            0.05,
+            Wait(0.05),
             STOP_NOW,
             send("Clear", latch=wrong_latch, code="WRONG_LATCH"),
             subject.clear,
@@ -102,7 +103,7 @@ async def watchdog_unread(subject: Subject) -> None:
 
     Run the count from a timer or with the samples, not in the handler of requests.
     """
-    await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.starve])
+    await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.feeding.starve])
     await asyncio.sleep(subject.judge.watchdog + 0.03)
     await subject.run([send("GetFaults")])
 
@@ -114,7 +115,7 @@ def what_feeds(subject: Subject) -> RequestRows:
     Restart the count for every accepted request that feeds, including a repeated Commit, a part
     that is kept and a last part that gets Taken.
     """
-    first_part, *_, last_part = subject.parts(*long_set(subject), token=3, now=0, count=3)
+    first_part, *_, last_part = subject.sets.parts(*long_set(subject), token=3, now=0, count=3)
     feeding_rows: list[Row] = [
         subject.ping,
         subject.layer_0(),
@@ -127,10 +128,10 @@ def what_feeds(subject: Subject) -> RequestRows:
         SILENCE_NOW,
         send("Arm", watchdog=subject.can["watchdog_max"]),
     ]
-    pause = max(0.02 - subject.exchange_time, 0.0)  # s; until it shows that it was fed
+    until_fed_shows = Wait(max(0.02 - subject.timing.exchange_time, 0.0))
     rows: list[Row] = [partial(subject.arm, 0.5)]
     for row in feeding_rows:
-        rows += [pause, row]
+        rows += [until_fed_shows, row]
     return rows
 
 
@@ -141,8 +142,8 @@ async def what_does_not_feed(subject: Subject) -> None:
     Restart the count only after all checks of the request have passed.
     """
     layers = long_set(subject)
-    first_part, *_ = subject.parts(*layers, token=7, now=0, count=3)
-    set_parts = subject.parts(*layers, token=8, now=0, count=3)
+    first_part, *_ = subject.sets.parts(*layers, token=7, now=0, count=3)
+    set_parts = subject.sets.parts(*layers, token=8, now=0, count=3)
     await subject.run([subject.arm, subject.layer_0()])
     for row in [
         *_readings(subject),
@@ -153,10 +154,10 @@ async def what_does_not_feed(subject: Subject) -> None:
         await subject.unfed()
         await subject.run([row])
     incomplete = commit(7, "INCOMPLETE")
-    await subject.run([send("Set", **first_part), 0.02, incomplete])
+    await subject.run([send("Set", **first_part), Wait(0.02), incomplete])
     part_rows = [send("Set", **part) for part in set_parts]
     staged_again = part_rows[0]  # which is dropped
-    await subject.run([*part_rows, 0.02, staged_again])
+    await subject.run([*part_rows, Wait(0.02), staged_again])
 
 
 def _readings(subject: Subject) -> list[Row]:
@@ -175,7 +176,7 @@ def _readings(subject: Subject) -> list[Row]:
 
 def _rejected_sets(subject: Subject) -> list[Row]:
     """Return sets that are rejected."""
-    (part,) = subject.parts(subject.layer_0(), token=7)
+    (part,) = subject.sets.parts(subject.layer_0(), token=7)
     flawed = {**part, "stream": [0xFFFF, 0, 0]}
     return [
         send("Ping", session=77, code="WRONG_SESSION"),
@@ -206,7 +207,7 @@ async def trips_amid_other_requests(subject: Subject) -> None:
 
     Do not let the reception of frames restart or delay the count.
     """
-    await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.starve])
+    await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.feeding.starve])
     rows: RequestRows = (
         send("GetFaults"),
         send("GetAchieved", layer=0),
@@ -215,7 +216,7 @@ async def trips_amid_other_requests(subject: Subject) -> None:
         partial(subject.client.exchange, 63, ()),
     )
     judge = subject.judge
-    end = judge.fed.earliest + 0.7 * judge.watchdog - subject.exchange_time
+    end = judge.fed.earliest + 0.7 * judge.watchdog - subject.timing.exchange_time
     for row in cycle(rows):
         if threads.now() > end:
             break
@@ -234,9 +235,9 @@ async def fault_list(subject: Subject) -> None:
     expected = [watchdog_fault, watchdog_fault, *await _listed_faults(subject)]
     tone = layer(0, subject.tone())
     trip = partial(_trip, subject, subject.shortest_watchdog / 1000, tone)
-    stop = STOP_NOW
     read = partial(_listed_faults, subject)
-    await subject.run([trip, subject.clear, trip, subject.clear, stop, subject.clear, read, 0.1])
+    clear = subject.clear
+    await subject.run([trip, clear, trip, clear, STOP_NOW, clear, read, Wait(0.1)])
     faults = await _listed_faults(subject)
     count = max(len(faults), 2)
     expect_equal(faults, expected[:count], "listed faults and channels")

@@ -13,10 +13,10 @@ from model.commands.options import (
     JsonOption,
     QuietOption,
     Stopwatch,
+    parse_point,
     print_report,
     progress_bar,
 )
-from model.config.units import parse_point
 from model.errors import InputError
 from model.quantities import counted, percent, percent_down
 

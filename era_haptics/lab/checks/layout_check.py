@@ -2,9 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import compress
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +10,7 @@ from controller.effects.effect import ON_RELEASE, Region
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
 from controller.play.intent import Target, band_problem
+from era_haptics.lab.checks.checked_effect import CheckedEffect, frequencies_of
 from era_haptics.lab.checks.strongest_target import strongest_target
 from era_haptics.lab.checks.touch_simulator import SimulatedTouch, TouchSimulator
 from model.arrays import FloatArray, Point
@@ -36,87 +35,6 @@ _COVERED = "is covered by later regions, or is off the plate"
 _ALIKE = 1.25  # ratio of frequencies that feel nearly alike
 _MIN_STEP = 0.008  # m; closer touches hardly differ
 _RESTING_AWAY = 0.06  # m, minimum distance from a touch to the resting finger
-
-
-@dataclass(frozen=True)
-class CheckedEffect:
-    """Simulated touches of an effect in a region.
-
-    on: layout key that plays the effect; promised_db_sl: None for as strong as the neighbors
-    allow; touches: at each position alone, then with a resting finger; area [m²]: share of the
-    region for each position.
-    """
-
-    region: str
-    effect: str
-    on: str
-    promised_db_sl: float | None
-    touches: tuple[SimulatedTouch, ...]
-    problems: tuple[str, ...]
-
-    @property
-    def felt(self) -> list[float]:
-        """Levels [dB SL] of all touches that are felt, over the effect."""
-        levels = [touch.felt_db_sl for touch in self.touches]
-        return [level for level in levels if level is not None]
-
-    @property
-    def contrasts(self) -> list[float]:
-        """Contrast with the resting finger on the nominal plate [dB]."""
-        contrasts = []
-        for touch in self.touches:
-            if touch.felt_db_sl is not None and touch.resting_db_sl is not None:
-                contrasts.append(touch.felt_db_sl - touch.resting_db_sl)
-        return contrasts
-
-    @property
-    def promised_contrasts(self) -> list[float]:
-        """Contrast with the resting finger on 90 % of plates [dB]."""
-        contrasts = [touch.promised_contrast_db for touch in self.touches]
-        return [contrast for contrast in contrasts if contrast is not None]
-
-    @property
-    def held_back_db(self) -> float:
-        """Largest reduction of a touch [dB] for the resting finger's sake."""
-        return max((touch.held_back_db for touch in self.touches), default=0.0)
-
-    @property
-    def exposure_m_s2(self) -> float:
-        """Highest weighted RMS acceleration of a touch [m/s²] (`exposures`)."""
-        return max((touch.exposure_m_s2 for touch in self.touches), default=0.0)
-
-    @property
-    def frequencies(self) -> list[float]:
-        """All frequencies played [Hz], ascending."""
-        return _frequencies_of(self.touches)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the JSON object of `era layout check --json`."""
-        return {
-            "region": self.region,
-            "effect": self.effect,
-            "on": self.on,
-            "promised_db_sl": self.promised_db_sl,
-            "felt_db_sl": distribution(self.felt),
-            "promised_contrast_db": distribution(self.promised_contrasts),
-            "felt_contrast_db": distribution(self.contrasts),
-            "held_back_db": self.held_back_db,
-            "exposure_m_s2": self.exposure_m_s2,
-            "frequency_hz": self.frequencies,
-            "touches": len(self.touches),
-            "problems": [*self.problems],
-        }
-
-
-def distribution(values: Sequence[float]) -> dict[str, float | None]:
-    """Return minimum, median and maximum; None without values."""
-    if not values:
-        return {"min": None, "median": None, "max": None}
-    return {
-        "min": float(min(values)),
-        "median": float(np.median(values)),
-        "max": float(max(values)),
-    }
 
 
 def check_layout(
@@ -185,12 +103,16 @@ def touch_positions(
 ) -> tuple[list[Point], float]:
     """Return up to `count` positions [m], evenly spaced over a region, and the area of each [m²].
 
-    Excludes parts that later regions cover, and parts outside the outline of the plate.
+    Excludes parts that later regions cover, and parts outside the plate or its outline.
     """
-    corners = [(0.0, 0.0), (plate.length, plate.width)]
+    sides = np.array([plate.length, plate.width])
+    low, high = np.zeros(2), sides
     if region is not None:
         corners = [*region.shape.corners()]
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+        low = np.clip(np.min(corners, axis=0), 0, sides)
+        high = np.clip(np.max(corners, axis=0), 0, sides)
+    if not (low < high).all():
+        return [], 0.0
     step = _MIN_STEP
     while True:
         grid, area = _grid(low, high, step)
@@ -234,7 +156,7 @@ def _resting(plate: Plate, at: Point, number: int) -> Point | None:
 
 
 def _silent(target: Target, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
-    """Yield that nothing is felt; the level that the neighbors allow can be zero."""
+    """Yield touches that are not felt; the level that the neighbors allow can be zero."""
     can_be_silent = target.level_db_sl is None
     silent = []
     for touch in touches:
@@ -253,17 +175,20 @@ def _off_level(
     if promised is None:
         return
     max_excess = MARGIN_TOLERANCE if has_margin else LEVEL_TOLERANCE
-    for sign, words, tolerance in ((-1, "below", LEVEL_TOLERANCE), (1, "above", max_excess)):
-        differences: dict[SimulatedTouch, float] = {}
-        for touch in touches:
-            if touch.felt_db_sl is None:
-                continue
-            difference = sign * (touch.felt_db_sl - promised)
-            if difference > tolerance:
-                differences[touch] = difference
+    below: dict[SimulatedTouch, float] = {}
+    above: dict[SimulatedTouch, float] = {}
+    for touch in touches:
+        if touch.felt_db_sl is None:
+            continue
+        excess = touch.felt_db_sl - promised
+        if -excess > LEVEL_TOLERANCE:
+            below[touch] = -excess
+        elif excess > max_excess:
+            above[touch] = excess
+    for direction, differences in (("below", below), ("above", above)):
         if differences:
             yield (
-                f"level is up to {max(differences.values()):.1f} dB {words} {promised:g} dB SL "
+                f"level is up to {max(differences.values()):.1f} dB {direction} {promised:g} dB SL "
                 f"{_location([*differences], touches, area)}"
             )
 
@@ -304,7 +229,7 @@ def _off_band(
     must_be_alike: bool,
 ) -> Iterator[str]:
     """Yield frequencies that depend on the position, or a band without a frequency of the table."""
-    frequencies = _frequencies_of(touches)
+    frequencies = frequencies_of(touches)
     if not frequencies:
         return
     low, high = frequencies[0], frequencies[-1]
@@ -318,14 +243,6 @@ def _off_band(
     problem = band_problem(band, table.frequencies)
     if problem is not None:
         yield problem
-
-
-def _frequencies_of(touches: Sequence[SimulatedTouch]) -> list[float]:
-    """Return all frequencies played [Hz], ascending."""
-    frequencies: set[float] = set()
-    for touch in touches:
-        frequencies.update(touch.frequencies)
-    return sorted(frequencies)
 
 
 def _location(

@@ -11,8 +11,8 @@ from model.quantities import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from era_haptics.lab.checks.checked_effect import CheckedEffect
     from era_haptics.lab.checks.joint_touches import JointTouch
-    from era_haptics.lab.checks.layout_check import CheckedEffect
 
 _MIN_SHOWN = 0.05  # dB
 
@@ -132,7 +132,7 @@ def _rows_of_matrix(together: "Sequence[JointTouch]") -> list[str]:
 
 def _span(values: list[float]) -> str:
     """Format the range and the median of values."""
-    from era_haptics.lab.checks.layout_check import distribution
+    from era_haptics.lab.checks.checked_effect import distribution
 
     row = distribution(values)
     return f"{row['min']:.1f} to {row['max']:.1f} (median {row['median']:.1f})"

@@ -14,8 +14,8 @@ from matplotlib.patches import Polygon as Outline
 from matplotlib.patheffects import withStroke
 
 from controller.effects.layout import SurfaceLayout
+from era_haptics.lab.checks.checked_effect import CheckedEffect
 from era_haptics.lab.checks.joint_touches import JointTouch, matrix_of
-from era_haptics.lab.checks.layout_check import CheckedEffect
 from era_haptics.lab.checks.touch_simulator import SimulatedTouch
 from model.answer.answer import OWN_CONTRAST_DB
 from model.arrays import FloatArray, Point

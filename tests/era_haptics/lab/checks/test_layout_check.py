@@ -38,10 +38,11 @@ from controller.play.selection import Selector
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.command import run_era
 from era_haptics.lab.checks import joint_touches, layout_check
+from era_haptics.lab.checks.checked_effect import CheckedEffect
 from era_haptics.lab.checks.content_check import check_content
 from era_haptics.lab.checks.content_figure import content_figure
 from era_haptics.lab.checks.joint_touches import JointTouch, check_together, close_pairs
-from era_haptics.lab.checks.layout_check import CheckedEffect, check_layout
+from era_haptics.lab.checks.layout_check import check_layout
 from era_haptics.lab.checks.touch_simulator import loaded_plate
 from era_haptics.lab.cli import app
 from kit.fingers import WIRES, Pressed, playable
@@ -121,6 +122,21 @@ def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
     assert 9.0 <= missing <= 13.0
     assert short.frequencies == [100.0]
     assert "100 % of the region (1.4 cm²)" in problem
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_check_touches_only_the_part_of_a_region_that_is_on_the_plate() -> None:
+    """A region of 40 mm by 12 mm, half of it beyond the east edge, and one beyond it."""
+    length = table().plate.length
+    half = checked(
+        Region("half", Rectangle(length - 0.02, 0.04, 0.04, 0.012), on_press="it"), Buzz()
+    )
+    assert {touch.reason for touch in half.touches} == {None}
+    assert all(length - 0.02 < touch.at[0] < length for touch in half.touches)
+    beyond = checked(
+        Region("beyond", Rectangle(length + 0.02, 0.04, 0.04, 0.012), on_press="it"), Buzz()
+    )
+    assert (beyond.touches, len(beyond.problems)) == ((), 1)
 
 
 @pytest.mark.usefixtures("plain_pictures")

@@ -12,10 +12,9 @@ from era_haptics.drive import (
     expect_rig,
     warn_of_surface,
 )
+from model.answer import answer_report, plan
 from model.answer.answer import APART_HZ, Answer
 from model.answer.answer_report import Measures, Timing
-from model.answer.answer_report import measures as _measures
-from model.answer.plan import answer as _answer
 from model.answer.stimulus import MUST, Finger, Stimulus
 from model.arrays import FloatArray
 from model.errors import InputError, expect_instance, expect_number, shown
@@ -129,7 +128,7 @@ def answer(
     expect_number(apart_hz, what="apart_hz", unit="hertz")
     if drive_mode is not None:
         _expect_mode(drive_mode)
-    result = _answer(
+    result = plan.answer(
         table,
         fingers,
         quiet=as_fingers(quiet, what="quiet"),
@@ -152,7 +151,7 @@ def measures(table: LocalizationTable, answer: Answer) -> Measures:
     """
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_instance(answer, Answer, what="answer", made_by="era.query(table, target)")
-    return _measures(table, answer, timing=_timing(table))
+    return answer_report.measures(table, answer, timing=_timing(table))
 
 
 def contrast_map(
@@ -202,6 +201,7 @@ def _expect_mode(drive_mode: object) -> None:
         raise InputError(f"drive_mode must be a name such as 'phased', got {shown(drive_mode)}")
 
 
-@lru_cache(maxsize=2)  # notebooks query one table many times, then the next
+@lru_cache(maxsize=2)
 def _timing(table: LocalizationTable) -> Timing:
+    """Return the timing of a table, cached for two: notebooks query a table often, then another."""
     return Timing(table)

@@ -217,7 +217,7 @@ def _fault_file(path: Path | None, rig: "Rig") -> "FaultFile":
 
 def _finger_positions(options: Sequence[str]) -> dict[str, "Point"]:
     """Positions [m] of fingers by id, numbered from 1; raises InputError."""
-    from model.config.units import parse_point
+    from model.commands.options import parse_point
 
     fingers = {}
     for number, text in enumerate(options, start=1):

@@ -195,7 +195,7 @@ def touch(
     touch 0.05,0.18:0.30,0.18 --for 2`. Each finger feels the layout's effect at its position.
     Without a layout, the last finger feels a buzz and the others are quiet.
     """
-    from model.config.units import parse_point
+    from model.commands.options import parse_point
 
     paths = []
     for text in at:

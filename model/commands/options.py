@@ -1,7 +1,9 @@
 """Options, parsing and reports that several commands share."""
 
 import json
+import math
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -17,6 +19,7 @@ from model.errors import InputError
 from registry.streams import drawing_on
 
 if TYPE_CHECKING:
+    from model.arrays import FloatArray
     from model.processes import Progress
 
 FAILED = 1
@@ -201,3 +204,63 @@ def figure_size(text: str | None) -> tuple[float, float] | None:
     if not (2 <= width <= 200 and 2 <= height <= 200):  # False for NaN
         raise InputError(f"--size must be WxH in cm, 2 to 200 each, such as 16x10, got {text!r}")
     return width / 2.54, height / 2.54
+
+
+# Values of options
+
+_MAX_FREQUENCIES = 2000  # more is a typing error
+
+
+def parse_point(text: str, *, what: str) -> tuple[float, float]:
+    """Parse `X,Y` to a position [m]; what: the option, for the error."""
+    parts = text.split(",")
+    try:
+        x, y = (float(part) for part in parts)
+    except ValueError:
+        raise InputError(
+            f"{what} must be X,Y in meters without a unit, such as {what} 0.10,0.08, got {text!r}"
+        ) from None
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f"{what}: both coordinates must be finite, got {text!r}")
+    return x, y
+
+
+def parse_pair(text: str, *, what: str) -> tuple[int, int]:
+    """Parse `12x9` to two counts."""
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)
+    if match is None:
+        raise InputError(f"{what} must be two numbers such as 12x9, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def parse_frequencies(text: str, *, what: str = "--frequencies") -> "FloatArray":
+    """Parse `LO:HI:STEP`, both ends included, or a list `60,110,250`, to frequencies (f,) [Hz].
+
+    Raises InputError for other text, and for a list that does not ascend.
+    """
+    import numpy as np  # which other commands do without
+
+    try:
+        if ":" in text:
+            low, high, step = (float(part) for part in text.split(":"))
+            count = int((high - low) / step + 1e-9) + 1
+            if not (0 < low <= high and step > 0 and count <= _MAX_FREQUENCIES):
+                raise ValueError
+            return np.asarray(low + step * np.arange(count))
+        values = np.array([float(part) for part in text.split(",")])
+        if not (len(values) <= _MAX_FREQUENCIES and np.isfinite(values).all() and min(values) > 0):
+            raise ValueError
+    except (ValueError, OverflowError, ZeroDivisionError):
+        raise InputError(
+            f"{what} must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
+            f"60:320:10, or a list above zero, such as 60,110, and at most "
+            f"{_MAX_FREQUENCIES} frequencies, got {text[:40]!r}"
+        ) from None
+    distinct, counts = np.unique(values, return_counts=True)
+    if len(distinct) < len(values):
+        raise InputError(
+            f"{what} must be distinct, got {distinct[counts.argmax()]:g} Hz twice in {text[:40]!r}"
+        )
+    if (np.diff(values) < 0).any():
+        raise InputError(f"{what} must ascend, got {text[:40]!r}; sort them")
+    return values

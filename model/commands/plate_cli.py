@@ -17,11 +17,12 @@ from model.commands.options import (
     Stopwatch,
     figure_size,
     next_line,
+    parse_frequencies,
+    parse_pair,
     print_report,
     progress_bar,
 )
 from model.commands.plate_show_cli import in_gpa
-from model.config.units import parse_frequencies, parse_pair
 from model.errors import InputError, expect_between
 from model.files.output_paths import check_picture
 from model.quantities import counted

@@ -23,10 +23,12 @@ from model.commands.options import (
     TableArgument,
     figure_size,
     next_line,
+    parse_frequencies,
+    parse_pair,
+    parse_point,
     print_report,
     progress_bar,
 )
-from model.config.units import parse_frequencies, parse_pair, parse_point
 from model.drive_modes import checked_mode, drive_modes_in_words
 from model.errors import InputError
 from model.files.output_paths import (

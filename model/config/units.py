@@ -1,4 +1,4 @@
-"""Values with a unit (`12 in`, `70 GPa`), bare SI numbers, and points, pairs and ranges as text."""
+"""Values with a unit, such as `12 in` or `70 GPa`, and bare numbers in SI units."""
 
 import math
 import re
@@ -12,8 +12,6 @@ from model.errors import InputError
 
 if TYPE_CHECKING:
     import pint
-
-    from model.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -203,24 +201,6 @@ def as_written(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
-# More is a typing error.
-MAX_FREQUENCIES = 2000
-
-
-def parse_point(text: str, *, what: str) -> tuple[float, float]:
-    """Parse `X,Y` to a position [m]; what: the option, for the error."""
-    parts = text.split(",")
-    try:
-        x, y = (float(part) for part in parts)
-    except ValueError:
-        raise InputError(
-            f"{what} must be X,Y in meters without a unit, such as {what} 0.10,0.08, got {text!r}"
-        ) from None
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InputError(f"{what}: both coordinates must be finite, got {text!r}")
-    return x, y
-
-
 def in_meters(x: float, y: float, *, length: float, width: float) -> str:
     """Return the remedy for a position that would be on the plate in cm or mm, else "".
 
@@ -234,45 +214,3 @@ def in_meters(x: float, y: float, *, length: float, width: float) -> str:
                 f"{x / count:g},{y / count:g}"
             )
     return ""
-
-
-def parse_pair(text: str, *, what: str) -> tuple[int, int]:
-    """Parse `12x9` to two counts."""
-    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)
-    if match is None:
-        raise InputError(f"{what} must be two numbers such as 12x9, got {text!r}")
-    return int(match[1]), int(match[2])
-
-
-def parse_frequencies(text: str) -> "FloatArray":
-    """Parse `LO:HI:STEP`, both ends included, or a list `60,110,250`, to frequencies (f,) [Hz].
-
-    Raises InputError for other text, and for a list that does not ascend.
-    """
-    import numpy as np  # which other commands do without
-
-    try:
-        if ":" in text:
-            low, high, step = (float(part) for part in text.split(":"))
-            count = int((high - low) / step + 1e-9) + 1
-            if not (0 < low <= high and step > 0 and count <= MAX_FREQUENCIES):
-                raise ValueError
-            return np.asarray(low + step * np.arange(count))
-        values = np.array([float(part) for part in text.split(",")])
-        if not (len(values) <= MAX_FREQUENCIES and np.isfinite(values).all() and min(values) > 0):
-            raise ValueError
-    except (ValueError, OverflowError, ZeroDivisionError):
-        raise InputError(
-            f"--frequencies must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
-            f"60:320:10, or a list above zero, such as 60,110, and at most "
-            f"{MAX_FREQUENCIES} frequencies, got {text[:40]!r}"
-        ) from None
-    distinct, counts = np.unique(values, return_counts=True)
-    if len(distinct) < len(values):
-        raise InputError(
-            f"--frequencies must be distinct, got {distinct[counts.argmax()]:g} Hz twice in "
-            f"{text[:40]!r}"
-        )
-    if (np.diff(values) < 0).any():
-        raise InputError(f"--frequencies must ascend, got {text[:40]!r}; sort them")
-    return values

@@ -23,8 +23,8 @@ from era_haptics.lab.design.problem import (
     area_of,
 )
 from kit.outside_files import READERS, RIG
+from model.commands.options import parse_frequencies
 from model.config.document import read_document
-from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.estimate import calibrate
 from model.files.array_file import UNREADABLE, read_arrays

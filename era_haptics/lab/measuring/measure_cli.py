@@ -101,7 +101,7 @@ def measure(
     from era_haptics.lab.measuring.measure import measure_at_once, open_desk
     from era_haptics.lab.measuring.moved_sensor import measure_by_moving
     from era_haptics.lab.measuring.sensor_file import are_positions, read_sensors
-    from model.config.units import parse_frequencies
+    from model.commands.options import parse_frequencies
     from model.files.output_paths import check_ending, check_place
     from model.rig.rig_file import load_rig
 

@@ -95,7 +95,7 @@ def identify(
     responses.
     """
     from era_haptics.lab.measuring.measure import measure_plate
-    from model.config.units import parse_frequencies
+    from model.commands.options import parse_frequencies
     from model.rig.rig_file import load_rig
     from model.structure.modal_elasticity import check_measurable
 

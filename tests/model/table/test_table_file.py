@@ -21,8 +21,8 @@ import rig_page
 from key_tables import quantities
 from kit.plates import make_paper_rig, small_problem, small_table
 from model import caching
+from model.commands.options import parse_frequencies
 from model.config.fields import Section
-from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
 from model.finger import Grid

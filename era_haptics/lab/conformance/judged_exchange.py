@@ -25,6 +25,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import is_last
 from drivers.wires.wire import reply_words
 from era_haptics.lab.conformance.capabilities import STATED, Capabilities
+from era_haptics.lab.conformance.conformance_sets import ConformanceSets
 from era_haptics.lab.conformance.dating import Dating
 from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.judge_client import (
@@ -39,7 +40,6 @@ from era_haptics.lab.conformance.outcomes import (
     require_in_time,
 )
 from era_haptics.lab.conformance.request_rows import Send, send
-from era_haptics.lab.conformance.set_builder import SetBuilder
 from era_haptics.lab.conformance.stimuli import Stimuli
 from era_haptics.lab.conformance.watchdog_feeding import WatchdogFeeding
 from era_haptics.lab.expectations.expected_amplifier import request_text
@@ -75,7 +75,7 @@ class JudgedExchange(Stimuli):
         """Reply to Hello."""
         self.session = 1
         """Session begun last."""
-        self.sets = SetBuilder(can)
+        self.sets = ConformanceSets(can)
         self.feeding = WatchdogFeeding()
         self.dating = Dating()
         """Converts times to the amplifier's clock."""

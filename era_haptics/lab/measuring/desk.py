@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from era_haptics.lab.measuring.sensor_file import WiredSensor
-from era_haptics.lab.measuring.settling import settling_time
+from era_haptics.lab.measuring.settling import plate_settling_time
 from era_haptics.lab.measuring.wiring import SoundCardWiring
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -34,8 +34,8 @@ class Desk:
 
     @cached_property
     def settling(self) -> float:
-        """Time [s] that a run plays before its recording is analyzed; see `settling_time`."""
-        return settling_time(self.rig)
+        """Time [s] that a run plays before its recording is analyzed; see `plate_settling_time`."""
+        return plate_settling_time(self.rig)
 
     # Responses
 

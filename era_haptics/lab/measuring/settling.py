@@ -20,7 +20,7 @@ _MAX_SETTLING = 5.0  # s
 _REMAINING = 0.01  # of a free vibration, after settling
 
 
-def settling_time(rig: Rig) -> float:
+def plate_settling_time(rig: Rig) -> float:
     """Time [s] until free vibrations have decayed to 1 %, in whole periods from 1 to 5 s.
 
     The slowest mode within the rig's frequency limits decides, since signals stay within them.

@@ -10,7 +10,7 @@ from drivers.protocol.sets import LayerSet, pack_layers, parts
 from era_haptics.lab.conformance.capabilities import Capabilities
 
 
-class SetBuilder:
+class ConformanceSets:
     """Builds sets within an amplifier's capabilities, with consecutive tokens."""
 
     def __init__(self, can: Capabilities) -> None:

@@ -335,16 +335,14 @@ class LayerAllocation:
     def end(self, number: int) -> None:
         """Note that a layer is silent for certain."""
         self.may_play -= {number}
-        self.resume(self.slots, without=(number,))
+        remaining = {**self.slots}
+        remaining.pop(number, None)
+        self.reset(remaining)
 
-    def forget(self) -> None:
-        """Discard the playback, which is unknown; fingers keep their layers."""
-        self.slots = {}
-
-    def resume(self, slots: Mapping[int, Slot], *, without: Collection[int]) -> None:
-        """Take former slots as the playback again, except those of some layers."""
-        self.slots = {number: slot for number, slot in slots.items() if number not in without}
-        self._layer_of = {**self._layer_of, **_layers_by_key(self.slots)}
+    def reset(self, known: Mapping[int, Slot]) -> None:
+        """Discard the playback except known slots; fingers keep their layers."""
+        self.slots = known
+        self._layer_of = {**self._layer_of, **_layers_by_key(known)}
 
     def start_silence(self) -> None:
         """Note that all layers are to fall silent; they may play until `confirm_silence`."""

@@ -39,6 +39,8 @@ ENDED = (
     "the vibration has ended: it was not renewed, or a time limit was reached; touch there again"
 )
 
+_NO_SLOTS: Mapping[int, Slot] = {}
+
 _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; longest time without counting clocks while fingers change
 
 ChangeTimes = Mapping[ContactKey | None, float]
@@ -83,6 +85,18 @@ class Plan:
     def is_touch(self) -> bool:
         """Whether it responds to a finger that came, moved or pressed, not to lifts alone."""
         return any(key is not None for key in self.answered)
+
+    @property
+    def surviving_slots(self) -> dict[int, Slot]:
+        """Slots that surely still play if its sets are not played, by layer.
+
+        Layers that it ends may be silent or not; the next plan ends these again.
+        """
+        ended_layers = self.sets.layers.keys() - self.sets.started
+        slots = {**self.former_slots}
+        for number in ended_layers:
+            slots.pop(number, None)
+        return slots
 
 
 class Planner:
@@ -328,27 +342,26 @@ class Planner:
         """Note that the next plan can differ even if no contact changes."""
         self._intent_due = -math.inf
 
-    def forget(self) -> None:
-        """Discard the known playback; the next plan has a set, and fingers keep their layers."""
+    def forget(self, *, except_for: Mapping[int, Slot] = _NO_SLOTS) -> None:
+        """Discard the playback, except for known slots by layer.
+
+        The next plan has a set, and fingers keep their layers.
+        """
         self._last_plan = None
         self._retry_at = math.inf
-        self.slots.forget()
+        self.slots.forget(except_for=except_for)
 
     def not_played(self, plan: Plan, *, is_known: bool) -> None:
         """Let the fingers of a plan that was not played wait for the next plan.
 
-        The known playback is discarded. If is_known, the former contents still play, except that
-        layers ended by the plan may be silent or not; the next plan ends these again.
+        is_known: whether the former contents still play; otherwise, the playback is unknown.
         """
-        if plan.kind is not PlanKind.CHANGE:
-            if not is_known:
-                self.forget()
-            return
-        self.forget()
-        self._tracker.wait_again(plan.answered)
-        if is_known:
-            ended_layers = plan.sets.layers.keys() - plan.sets.started
-            self.slots.layers.resume(plan.former_slots, without=ended_layers)
+        if not is_known:
+            self.forget()
+        elif plan.kind is PlanKind.CHANGE:
+            self.forget(except_for=plan.surviving_slots)
+        if plan.kind is PlanKind.CHANGE:
+            self._tracker.wait_again(plan.answered)
 
     def drop_starts(self, plan: Plan) -> Plan:
         """Return a plan that only ends contents; contents that the plan starts wait again.

@@ -306,9 +306,9 @@ class Slots:
         for number in sets.layers:
             self.by_layer[number].put_off(until, is_update=number in sets.updates)
 
-    def forget(self) -> None:
-        """Discard the playback, which is unknown; fingers keep their layers."""
-        self.layers.forget()
+    def forget(self, *, except_for: Mapping[int, Slot]) -> None:
+        """Discard the playback, except for known slots by layer; fingers keep their layers."""
+        self.layers.reset(except_for)
         self.is_silence_planned = False
         self._ended_contents = ()
 

@@ -144,7 +144,7 @@ def test_a_replacement_that_was_dropped_still_fades_when_it_is_tried_again() -> 
     assert layers.allocate([later]) == {1: later}
     falling = playing[0].falling(1.0)
     layers.take({0: falling, 1: Slot(later, later.layer)}, {1})
-    layers.resume(playing, without=())
+    layers.reset(playing)
     assert layers.allocate([later]) == {2: later}
     assert layers.fade_time(2, later) == CROSSFADE
     falling.put_off(1.1, is_update=True)

@@ -517,11 +517,11 @@ def with_paths(
 
 def _path_of(contact: Contact, now: float, plate: Plate) -> tuple[Point, Point, Point] | None:
     """Return start, middle and end of the path to solve for; None if the contact rests."""
-    vx, vy = contact.motion.velocity(now)
+    vx, vy = contact.velocity(now)
     speed = math.hypot(vx, vy)
     if not speed:
         return None
-    last_seen = contact.motion.places[-1][0]
+    last_seen = contact.track[-1][0]
     answer_delay = now - last_seen + _ANSWER_TIME + ONSET_RAMP / 2
     stretch_time = STRETCH / speed
 

@@ -84,7 +84,7 @@ def _feels_alike(contact: Contact, former: Contact) -> bool:
 def _has_set_out(contact: Contact, former: Contact) -> bool:
     """Whether a contact that rested is moving now, and needs an answer for the path ahead."""
     has_moved = (contact.x, contact.y) != (former.x, former.y)
-    return has_moved and contact.motion.is_under_way and not former.motion.is_under_way
+    return has_moved and contact.is_under_way and not former.is_under_way
 
 
 def _targets_of(targets: Targets) -> frozenset[Target]:
@@ -324,7 +324,7 @@ class Selector:
         """Whether no contact moves at a time [s], and no pulse is active or limits contents."""
         if self._active_pulses(now) or self._lasting.is_limited:
             return False
-        return not any(any(contact.motion.velocity(now)) for contact in contacts)
+        return not any(any(contact.velocity(now)) for contact in contacts)
 
     def _improve(self, intended: Question, capabilities: PlaybackCapabilities, now: float) -> None:
         """Take the next step to a better answer at a time [s], or look for such an answer."""

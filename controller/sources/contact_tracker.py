@@ -10,7 +10,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from controller.sources.contact_load import IN_MM, LANDING, MIN_CHANGE, followed
-from controller.sources.touch import AT_REST, Change, Contact, ContactKey, Touch, TouchFrame
+from controller.sources.touch import (
+    Change,
+    Contact,
+    ContactKey,
+    Touch,
+    TouchFrame,
+    Track,
+    track_with,
+)
 from registry.limits import MAX_CONTACTS, MAX_FINGER_LOAD, MAX_FINGERS, MAX_HAND_LOAD
 
 if TYPE_CHECKING:  # numpy is slow to import
@@ -147,11 +155,11 @@ class ContactTracker:
         y = (1 - touch.y) * self._plate.width
         since = time
         load = 1.0
-        motion = AT_REST
+        track: Track = ()
         if former is not None:
             since = former.since
             load = former.load
-            motion = former.motion
+            track = former.track
         reported = self._reported_load(touch)
         largest = max(load, reported or 0.0)
         if largest > MAX_FINGER_LOAD:
@@ -161,7 +169,7 @@ class ContactTracker:
             return Contact(key, x, y, since, hand_load)
         if reported is not None and time - since >= LANDING:
             load = followed(load, reported)
-        return Contact(key, x, y, since, load, motion.followed(time, x, y))
+        return Contact(key, x, y, since, load, track_with(track, time, x, y))
 
     def _reported_load(self, touch: Touch) -> float | None:
         """Return the load of a touch, or the load for its size; None if neither is reported."""

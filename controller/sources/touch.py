@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import linear_regression
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 from urllib.parse import parse_qsl
 
 from model.errors import InputError
@@ -192,54 +192,22 @@ def open_source(url: str) -> TouchSource:
     return TOUCH_SOURCES.make(url)
 
 
-@dataclass(frozen=True, slots=True)
-class FingerMotion:
-    """The recent path of a finger.
-
-    Its velocity is the least-squares slope of its positions over the last 60 ms. Reported positions
-    have errors of a millimeter: a finger whose positions differ by less than 3 mm in that time
-    counts as resting.
-    """
-
-    places: tuple[tuple[float, float, float], ...] = ()
-    """Time [s], x and y [m] of each position; the last one is the current position."""
-
-    def followed(self, time: float, x: float, y: float) -> "FingerMotion":
-        """Return the path with another position at a time [s]."""
-        start = time - OVER
-        recent = [place for place in self.places if start < place[0] < time]
-        return FingerMotion((*recent, (time, x, y)))
-
-    def velocity(self, now: float) -> tuple[float, float]:
-        """Return the velocity [m/s] at a time [s]; zero for a resting finger."""
-        start = now - OVER
-        places = [place for place in self.places if place[0] > start]
-        if not places:
-            return 0.0, 0.0
-        times, x_values, y_values = zip(*places, strict=True)
-        duration = times[-1] - times[0]
-        if duration < _MIN_DURATION:
-            return 0.0, 0.0
-        vx = linear_regression(times, x_values).slope
-        vy = linear_regression(times, y_values).slope
-        is_moving = math.hypot(vx, vy) * duration >= _MIN_DISTANCE
-        return (vx, vy) if is_moving else (0.0, 0.0)
-
-    @property
-    def is_under_way(self) -> bool:
-        """Whether it moved at its last report."""
-        return len(self.places) > 0 and any(self.velocity(self.places[-1][0]))
-
-
-AT_REST = FingerMotion()
-"""Motion of a finger with unknown path."""
-
-
 class ContactKey(NamedTuple):
     """Identifies a contact: its source and the id within that source."""
 
     source: str
     id: int
+
+
+Track: TypeAlias = tuple[tuple[float, float, float], ...]
+"""Time [s], x and y [m] of the recent positions of a finger."""
+
+
+def track_with(track: Track, time: float, x: float, y: float) -> Track:
+    """Return a track with another position at a time [s], without positions that are too old."""
+    start = time - OVER
+    recent = [place for place in track if start < place[0] < time]
+    return (*recent, (time, x, y))
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +223,8 @@ class Contact:
     """Time [s] of its touch-down."""
     load: float = 1.0
     """Load relative to the rig's fingertip, bounded and in steps; 1 if not reported."""
-    motion: FingerMotion = field(default=AT_REST, compare=False)
-    """Its recent path."""
+    track: Track = field(default=(), compare=False)
+    """Its recent positions; the last one is the current position. Empty for a hand."""
     is_surplus: bool = False
     """Whether max_fingers other fingers came before it."""
 
@@ -271,6 +239,31 @@ class Contact:
         if self.is_hand:
             return HAND_FEELS_NOTHING
         return SURPLUS if self.is_surplus else None
+
+    def velocity(self, now: float) -> tuple[float, float]:
+        """Return the velocity [m/s] at a time [s]; zero for a resting finger.
+
+        This is the least-squares slope of the positions over the last 60 ms. Reported positions
+        have errors of a millimeter: a finger whose positions differ by less than 3 mm in that time
+        counts as resting.
+        """
+        start = now - OVER
+        places = [place for place in self.track if place[0] > start]
+        if not places:
+            return 0.0, 0.0
+        times, x_values, y_values = zip(*places, strict=True)
+        duration = times[-1] - times[0]
+        if duration < _MIN_DURATION:
+            return 0.0, 0.0
+        vx = linear_regression(times, x_values).slope
+        vy = linear_regression(times, y_values).slope
+        is_moving = math.hypot(vx, vy) * duration >= _MIN_DISTANCE
+        return (vx, vy) if is_moving else (0.0, 0.0)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it moved at its last report."""
+        return len(self.track) > 0 and any(self.velocity(self.track[-1][0]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from controller.play.joint_answers import answered, with_paths
 from controller.play.layers import CROSSFADE
 from controller.play.reports import PlayReport
 from controller.play.shared_capabilities import RAMPS_ONLY
-from controller.sources.touch import AT_REST, Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey, Track, track_with
 from drivers.host.group import Group
 from kit.chain import Chain, Position
 from kit.clock import in_virtual_time, run_virtual
@@ -235,11 +235,11 @@ NOW = 5.0
 
 def contact(number: int, at: tuple[float, float], vx: float = 0.0, vy: float = 0.0) -> Contact:
     """A contact with a velocity [m/s], at its place now, reported every 10 ms."""
-    motion = AT_REST
+    track: Track = ()
     for step in range(-5, 1):
         time = 0.01 * step
-        motion = motion.followed(NOW + time, at[0] + vx * time, at[1] + vy * time)
-    return Contact(ContactKey("a", number), *at, since=0.0, motion=motion)
+        track = track_with(track, NOW + time, at[0] + vx * time, at[1] + vy * time)
+    return Contact(ContactKey("a", number), *at, since=0.0, track=track)
 
 
 def fingers(contacts: Sequence[Contact]) -> list[Finger]:

@@ -19,11 +19,13 @@ from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import (
     CONTACT_TIMEOUT,
     OVER,
+    Contact,
     ContactKey,
-    FingerMotion,
     RejectCounter,
     Touch,
     TouchFrame,
+    Track,
+    track_with,
 )
 from controller.sources.touch_calibration import turned
 from model.structure.material import Material
@@ -426,12 +428,13 @@ def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -
 FRAME = 0.010  # s
 
 
-def moved(places: np.ndarray) -> FingerMotion:
+def moved(places: np.ndarray) -> Contact:
     """A finger reported every 10 ms at these places (n, 2) [m]; the last at time 0."""
-    motion, count = FingerMotion(), len(places)
+    track: Track = ()
+    count = len(places)
     for number, (x, y) in enumerate(places.tolist(), start=1):
-        motion = motion.followed((number - count) * FRAME, x, y)
-    return motion
+        track = track_with(track, (number - count) * FRAME, x, y)
+    return Contact(ContactKey("a", 1), x, y, since=0.0, track=track)
 
 
 def test_velocity_is_that_of_a_steady_way() -> None:
@@ -498,7 +501,7 @@ def test_a_hand_is_one_until_it_is_lifted() -> None:
     ):
         tracker.update(TouchFrame("a", time, (Touch(1, 0.5 + time / 10, 0.5, load),)))
         (contact,) = tracker.contacts
-        seen.append((contact.is_hand, contact.load, contact.motion.is_under_way))
+        seen.append((contact.is_hand, contact.load, contact.is_under_way))
     assert seen == [(load > 1, load, False) for load in (1.0, *[12.0] * 3, *[19.0] * 2)]
 
 

@@ -28,6 +28,7 @@ from controller.play.routing import (
 from controller.play.selected_contents import Content
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
+from drivers.host.set_admission import StagedSet
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import QUANTITIES
 from model.answer import answer
@@ -71,13 +72,13 @@ class Sets:
     """When [s] an event no longer preempts endings and pieces of courses."""
 
     @cached_property
-    def by_amplifier(self) -> dict[str, list[AmplifierLayer]]:
-        """The layers of each amplifier, by name."""
-        by_amplifier: dict[str, list[AmplifierLayer]] = {}
+    def by_amplifier(self) -> dict[str, StagedSet]:
+        """The set of each amplifier, by name."""
+        layers_by_amplifier: dict[str, list[AmplifierLayer]] = {}
         for plate_layer in self.layers.values():
             for name, layer in plate_layer.items():
-                by_amplifier.setdefault(name, []).append(layer)
-        return by_amplifier
+                layers_by_amplifier.setdefault(name, []).append(layer)
+        return {name: StagedSet(layers) for name, layers in layers_by_amplifier.items()}
 
     @property
     def is_empty(self) -> bool:

@@ -211,7 +211,7 @@ class Cycle:
             has_event = self._wake.is_set()  # a touch, or a request of a client
             return has_event and threads.now() < sets.preempted_until
 
-        played = await self.group.apply(sets.by_amplifier, is_preempted if sets.updates else None)
+        played = await self.group.play(sets.by_amplifier, is_preempted if sets.updates else None)
         planner.confirm(sets, played, now=threads.now())
         return played.starts_at
 

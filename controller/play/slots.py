@@ -26,7 +26,7 @@ from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
-from drivers.playing import AmplifierLayer
+from drivers.host.set_admission import StagedSet
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer
@@ -41,7 +41,7 @@ RETRY = 1.0
 
 _VALID_FOR = QUANTITIES["valid_for"]
 
-Check = Callable[[Mapping[str, Sequence[AmplifierLayer]]], CommandRefused | None]
+Check = Callable[[Mapping[str, StagedSet]], CommandRefused | None]
 """Returns why the ledgers would refuse layers (by amplifier) now; None if they would admit them."""
 
 _logger = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class Slots:
         capabilities: PlaybackCapabilities,
         timing: Timing,
         *,
-        check: Check = lambda layers: None,
+        check: Check = lambda sets: None,
         expiry_of: Callable[[ContactKey], float],
     ) -> None:
         self._rig = rig
@@ -119,6 +119,8 @@ class Slots:
                     skipped.append(content)
                     remaining.remove(content)
             sets, refusal = self._shaped_or_plain(remaining, now)
+        if not skipped:
+            return sets
         return replace(sets, skipped=skipped, reason=reason, retry_at=retry_at)
 
     def _shaped_or_plain(

@@ -218,7 +218,7 @@ async def drive(
         await _check_not_latched(amplifier, url)
         try:
             await amplifier.arm(random_session(), watchdog)
-            await amplifier.stage(_TOKEN, [layer], now=True)
+            await amplifier.stage(StagedSet([layer]), _TOKEN, now=True)
             achieved = await amplifier.request("GetAchieved", {"layer": layer.number})
             await keep_alive(amplifier, duration, watchdog / 5)
         finally:
@@ -357,7 +357,7 @@ class BlockingAmplifier:
         for number in range(self._amplifier.capabilities["layers"]):
             if number not in numbers:
                 all_layers.append(AmplifierLayer(number))  # silence
-        return await self._amplifier.stage(self._token, all_layers, now=True)
+        return await self._amplifier.stage(StagedSet(all_layers), self._token, now=True)
 
     async def _stopped(self) -> StopOutcome:
         return await self._amplifier.stop()

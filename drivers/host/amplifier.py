@@ -7,7 +7,7 @@ and replies show is noted by `AmplifierRecord`.
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,6 @@ from drivers.host.requests import Priority
 from drivers.host.set_admission import IsPreempted, StagedSet
 from drivers.host.statuses import MAX_CONTRADICTIONS, contradicted
 from drivers.host.stops import CONFIRM_INTERVAL, PendingStop, StopOutcome
-from drivers.playing import AmplifierLayer
 from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.definition import (
     ATTEMPTS,
@@ -53,22 +52,22 @@ class Amplifier(AmplifierRecord):
 
     async def stage(
         self,
+        staged: StagedSet,
         token: int,
-        layers: Sequence[AmplifierLayer],
         *,
         now: bool = False,
         priority: Priority = Priority.SET,
         is_preempted: IsPreempted | None = None,
     ) -> StagedSet:
-        """Stage a set under a token, or play it immediately if `now`.
+        """Stage a set under a token, or play it immediately if `now`; return it.
 
         The ledger admits it when its turn on the line comes, unless it is preempted then. Raises
         CommandRefused with the reason; Preempted if a stop came first; FrameError if two replies in
         a row have another token.
         """
-        staged = self.admission.set_of(layers)
         staged.token = token
         staged.is_immediate = now
+        staged.starts_at = None
         make = partial(self._make_set, staged, is_preempted)
         for _ in range(MAX_CONTRADICTIONS):
             reply = await self.line.submit(self, priority, "Set", make)
@@ -95,10 +94,10 @@ class Amplifier(AmplifierRecord):
             is_preempted=is_preempted,
         )
 
-    def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
-        """Return why the ledger would not admit layers now; None if it would."""
+    def refusal_of(self, staged: StagedSet) -> CommandRefused | None:
+        """Return why the ledger would not admit a set now; None if it would."""
         return self.admission.refusal_of(
-            layers, self.ledger, self._time(), set_time=self._sets_time()
+            staged, self.ledger, self._time(), set_time=self._sets_time()
         )
 
     def _sets_time(self) -> float:

@@ -253,7 +253,7 @@ class AmplifierRecord:
     def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now; `arrives`: when it arrives [s] unless it is delayed."""
         message = REQUESTS[name]
-        self.admission.expire_check()
+        self.admission.note_exchange()
         if message.shows_clock:
             # Earlier requests may be lost, so this may arrive as soon as its bits have passed.
             self.clock.sent(name, values, now, now + self.line.wire.takes)
@@ -318,7 +318,7 @@ class AmplifierRecord:
         Raises CommandRefused if two consecutive statuses contradict the requests sent.
         """
         now = self._time()
-        self.admission.expire_check()
+        self.admission.note_exchange()
         self.counts.last_round_trip = now - sent_at
         message = REQUESTS[name]
         if message.feeds:

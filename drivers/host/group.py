@@ -29,7 +29,7 @@ from drivers.host.joint_sets import JointSets, PlayedSet, UnplayedSet
 from drivers.host.line import Line
 from drivers.host.members import Members, is_lost, outcomes
 from drivers.host.requests import Priority
-from drivers.host.set_admission import IsPreempted
+from drivers.host.set_admission import IsPreempted, StagedSet
 from drivers.host.stops import StopOutcome
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, QUANTITIES, STOP_RAMP, check_watchdog
@@ -200,19 +200,24 @@ class Group:
             await self.stop()
 
     def beat(self) -> Coroutine[Any, Any, Sequence[object]]:
-        """Feed the watchdog of every amplifier that replies; raises as `apply`.
+        """Feed the watchdog of every amplifier that replies; raises as `play`.
 
         The status of each other amplifier is read meanwhile; if it replies again, it must still
         play its set.
         """
         return self._exchange(self._heartbeats.beat)
 
-    async def apply(
-        self,
-        layers: Mapping[str, Sequence[AmplifierLayer]],
-        is_preempted: IsPreempted | None = None,
+    async def apply(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> PlayedSet:
+        """Play layers on the amplifiers with these names, see `play`."""
+        sets = {}
+        for name, amplifier_layers in layers.items():
+            sets[name] = StagedSet(amplifier_layers)
+        return await self.play(sets)
+
+    async def play(
+        self, sets: Mapping[str, StagedSet], is_preempted: IsPreempted | None = None
     ) -> PlayedSet:
-        """Play layers on the amplifiers with these names; all start at one moment.
+        """Play sets on the amplifiers with these names; all start at one moment.
 
         If one amplifier refuses its set, none commits, and CommandRefused is raised; a set that
         only silences is not staged first. An amplifier that is no longer armed stops all.
@@ -222,7 +227,7 @@ class Group:
         is_preempted: called before a set is sent, and again before it is committed; if it returns
         True, Overtaken is raised and the current playback continues.
         """
-        outcome = await self._exchange(partial(self.sets.play, layers, is_preempted))
+        outcome = await self._exchange(partial(self.sets.play, sets, is_preempted))
         if isinstance(outcome, UnplayedSet):
             raise await self._react(outcome.failure, outcome.reason)
         return outcome
@@ -230,13 +235,13 @@ class Group:
     async def silence(self, ramp: float) -> float:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
 
-        Returns the time [s] at which the last request went out. Raises as `apply`.
+        Returns the time [s] at which the last request went out. Raises as `play`.
         """
         await self._exchange(partial(self.sets.silence, ramp))
         return self.members.last_sent_at
 
     def abort_exchange(self) -> None:
-        """End each `apply`, `silence` or `beat` in progress, so that silence can be sent next.
+        """End each `play`, `silence` or `beat` in progress, so that silence can be sent next.
 
         Requests that were not sent yet are dropped; one on the wire is awaited for at most 8 ms.
         """

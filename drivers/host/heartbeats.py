@@ -19,6 +19,7 @@ from drivers.host.joint_sets import JointSets, commit_of, word_passed_by_all
 from drivers.host.line import Line
 from drivers.host.members import Members, is_lost
 from drivers.host.requests import GRACE, Make, Priority
+from drivers.host.set_admission import StagedSet
 from drivers.protocol.definition import HEARTBEAT, REQUESTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
@@ -102,7 +103,13 @@ class Heartbeats:
             due = self._running_due.get(amplifier, 0.0)
             if is_shared and not amplifier.committed:
                 token = token or self._first_token(line_amplifiers)
-                feed = partial(amplifier.stage, token, (), now=True, priority=Priority.HEARTBEAT)
+                feed = partial(
+                    amplifier.stage,
+                    StagedSet(()),
+                    token,
+                    now=True,
+                    priority=Priority.HEARTBEAT,
+                )
             elif may_read and now >= due and amplifier.feeding.is_shown_by(now):
                 interval = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
                 self._running_due[amplifier] = now + max(interval, _STATUS_INTERVAL)

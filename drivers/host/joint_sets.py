@@ -28,7 +28,6 @@ from drivers.host.line import Line
 from drivers.host.members import Members, last_fed_at, outcomes
 from drivers.host.requests import Priority
 from drivers.host.set_admission import IsPreempted, StagedSet
-from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     AHEAD_MAX,
     HIGH_TIME,
@@ -105,8 +104,8 @@ class JointSets:
         """Note that all amplifiers have just been armed, and so play nothing."""
         self.is_incomplete = False
 
-    def refusal_of(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
-        """Return why ledgers would not admit layers by amplifier now; None if all would.
+    def refusal_of(self, sets: Mapping[str, StagedSet]) -> CommandRefused | None:
+        """Return why ledgers would not admit sets by amplifier now; None if all would.
 
         It returns None also while a set is in doubt, since that set is silenced first.
         """
@@ -114,51 +113,51 @@ class JointSets:
             return None
         amplifiers = self._members.amplifiers
         refusals = {}
-        for name, amplifier_layers in layers.items():
-            refusal = amplifiers[name].refusal_of(amplifier_layers)
+        for name, amplifier_set in sets.items():
+            refusal = amplifiers[name].refusal_of(amplifier_set)
             if refusal is not None:
                 refusals[name] = refusal
         return _merged(refusals) if refusals else None
 
     async def play(
         self,
-        layers: Mapping[str, Sequence[AmplifierLayer]],
+        sets: Mapping[str, StagedSet],
         is_preempted: IsPreempted | None = None,
     ) -> SetOutcome:
-        """Play layers on the amplifiers with these names; all start at one moment.
+        """Play sets on the amplifiers with these names; all start at one moment.
 
         is_preempted: called before the set is sent, and again before it is committed; if it returns
         True, the set is given up. Raises DriverError if it is unknown which amplifiers play the
         set.
         """
-        amplifiers = [self._members.amplifiers[name] for name in layers]
+        amplifiers = [self._members.amplifiers[name] for name in sets]
         amplifiers.sort(key=last_fed_at)
         lines = {amplifier.line for amplifier in amplifiers}
         self.is_on_several_lines = len(lines) > 1
         try:
-            return await self._play_on(amplifiers, layers, is_preempted)
+            return await self._play_on(amplifiers, sets, is_preempted)
         finally:
             self.is_on_several_lines = False
 
     async def _play_on(
         self,
         amplifiers: Sequence[Amplifier],
-        layers: Mapping[str, Sequence[AmplifierLayer]],
+        sets: Mapping[str, StagedSet],
         is_preempted: IsPreempted | None,
     ) -> SetOutcome:
         """Stage, judge, commit and report a set; amplifiers: in the order of staging."""
         epoch = self._members.epoch
         if self.token % _TOKENS_PER_CHECK == 0:
             await self._close_gaps()
-        is_silent = all(map(is_silence, layers.values()))
-        is_immediate = is_silent or len(layers) == 1
+        is_silent = all(is_silence(amplifier_set.requested) for amplifier_set in sets.values())
+        is_immediate = is_silent or len(sets) == 1
         began = threads.now()
         token = self.next_token()
         stagings = []
         for amplifier in amplifiers:
             staging = amplifier.stage(
+                sets[amplifier.name],
                 token,
-                layers[amplifier.name],
                 now=is_immediate,
                 priority=Priority.SILENCE if is_silent else Priority.SET,
                 is_preempted=is_preempted,
@@ -304,7 +303,8 @@ class JointSets:
                 behind.append(amplifier)
         if behind:
             token = self.next_token()
-            await self._members.all([amplifier.stage(token, (), now=True) for amplifier in behind])
+            stagings = [amplifier.stage(StagedSet(()), token, now=True) for amplifier in behind]
+            await self._members.all(stagings)
 
 
 def _staged_sets(

@@ -40,7 +40,9 @@ class StagedSet:
     delay: float = 0.0
     """Longest time from staging until it is committed [s]."""
     checked_until: float = -math.inf
-    """Until when its check is valid [s]."""
+    """Until when its check is valid [s], if nothing is sent or received meanwhile."""
+    exchanges: int = 0
+    """Number of messages of its amplifier before its check."""
     token: int = 0
     """0 until it is staged."""
     is_immediate: bool = False
@@ -61,19 +63,12 @@ class SetAdmission:
 
     admitted: StagedSet | None = None
     """The set that is staged and not committed yet; None after a stop, disarm or silence."""
-    _checked: StagedSet | None = None
-    """The set that was checked last, unless anything was sent or received since."""
+    _exchanges: int = 0
+    """Number of messages that were sent to the amplifier or received from it."""
 
     def __init__(self, name: str, identification: AmplifierIdentification) -> None:
         self._name = name
         self._identification = identification
-
-    def set_of(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
-        """Return the set of these layers that was checked last, or else a new one."""
-        checked = self._checked
-        if checked is not None and checked.requested is layers and not checked.token:
-            return checked
-        return StagedSet(layers)
 
     def admit(
         self,
@@ -92,27 +87,24 @@ class SetAdmission:
         """
         if is_preempted is not None and is_preempted():
             raise Overtaken(f"amplifier {self._name}: set {staged.token} is preempted")
-        if now > staged.checked_until:
+        if now > staged.checked_until or staged.exchanges != self._exchanges:
             self._check(staged, ledger, now, set_time=set_time)
         staged.until = now + staged.delay
         self.admitted = staged
         return parts(staged.stream, session=session, token=staged.token, now=staged.is_immediate)
 
     def refusal_of(
-        self, layers: Sequence[AmplifierLayer], ledger: Ledger, now: float, *, set_time: float
+        self, staged: StagedSet, ledger: Ledger, now: float, *, set_time: float
     ) -> CommandRefused | None:
-        """Return why the ledger would not admit layers now; None if it would.
+        """Return why the ledger would not admit a set now; None if it would.
 
-        The check counts if the layers are staged within 5 ms and nothing is sent or received
+        The set is not checked again if it is staged within 5 ms and nothing is sent or received
         meanwhile. set_time: see `admit`.
         """
-        checked = StagedSet(layers)
         try:
-            self._check(checked, ledger, now, set_time=set_time, valid_for=_CHECKED_FOR)
+            self._check(staged, ledger, now, set_time=set_time, valid_for=_CHECKED_FOR)
         except CommandRefused as error:
             return error
-        self.expire_check()
-        self._checked = checked
         return None
 
     def _check(
@@ -140,6 +132,7 @@ class SetAdmission:
             )
         staged.delay = delay
         staged.checked_until = now + valid_for
+        staged.exchanges = self._exchanges
 
     def check(self, token: int, now: float, *, may_be_late: bool) -> None:
         """Raise Preempted or CommandRefused unless the set with a token may be sent now.
@@ -156,11 +149,9 @@ class SetAdmission:
                 until=now,
             )
 
-    def expire_check(self) -> None:
-        """End the validity of the last check, because something was sent or received."""
-        if self._checked is not None:
-            self._checked.checked_until = -math.inf
-            self._checked = None
+    def note_exchange(self) -> None:
+        """Note that something was sent or received, which ends the validity of all checks."""
+        self._exchanges += 1
 
     def withdraw(self) -> None:
         """Let the staged set not be committed, because the amplifier is silenced or armed."""

@@ -27,6 +27,7 @@ from drivers.by_hand.cli import app
 from drivers.by_hand.discovery import identify_all
 from drivers.by_hand.links import Arrangement, arrangement_of, check_links
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
+from drivers.host.set_admission import StagedSet
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, READINGS, STATUS_FLAGS
@@ -73,7 +74,9 @@ async def leave_playing(far: WordFarSide, number: int = 1) -> None:
     )
     await amplifier.open()
     await amplifier.arm(77, LONG_WATCHDOG)
-    await amplifier.stage(5, [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)], now=True)
+    await amplifier.stage(
+        StagedSet([AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]), 5, now=True
+    )
     await lines.close()
     assert far.level(number) == pytest.approx(0.5)
 

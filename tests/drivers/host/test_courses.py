@@ -25,6 +25,7 @@ from drivers.host.group import Group
 from drivers.host.joint_sets import PlayedSet
 from drivers.host.ledger import Ledger
 from drivers.host.requests import Priority
+from drivers.host.set_admission import StagedSet
 from drivers.host.stops import StopOutcome
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, MESSAGES, STATES
@@ -153,7 +154,8 @@ class OnLines(Taken):
 
     def plans_nothing(self, text: str) -> None:
         """Require that what is planned is refused, with this text."""
-        assert text in str(self.group.sets.refusal_of({"a": [_layer((0, 0, 0.5, 100.0))]}))
+        planned = {"a": StagedSet([_layer((0, 0, 0.5, 100.0))])}
+        assert text in str(self.group.sets.refusal_of(planned))
 
     async def applies(self, **rows: Sequence[Sequence[float] | Mapping[str, Any]]) -> None:
         """Apply layers of rows by amplifier."""
@@ -167,16 +169,17 @@ class OnLines(Taken):
     async def plays_unless_one_has_come(self, level: float) -> None:
         """Do the same, and give way as soon as `has_come`."""
         layers = [_layer((0, 0, level, 100.0))]
-        await self.group.apply(dict.fromkeys(self.group.amplifiers, layers), lambda: self.has_come)
+        sets = {name: StagedSet(layers) for name in self.group.amplifiers}
+        await self.group.play(sets, lambda: self.has_come)
 
     def plans(self, level: float) -> None:
         """Ask whether the first amplifier may play 100 Hz at a level: it may."""
-        self.planned = {"a": [_layer((0, 0, level, 100.0))]}
+        self.planned = {"a": StagedSet([_layer((0, 0, level, 100.0))])}
         assert self.group.sets.refusal_of(self.planned) is None
 
     async def plays_as_planned(self) -> None:
         """Play what the first amplifier may play, as it was asked."""
-        await self.group.apply(self.planned)
+        await self.group.play(self.planned)
 
     async def waits_past_the_start(self, seconds: float) -> None:
         """Wait until so long after the moment at which what was applied last starts."""

@@ -20,7 +20,7 @@ import pytest
 from drivers.errors import CommandError, CommandRefused, LinkTimeout
 from drivers.host.ledger import Ledger
 from drivers.host.requests import Job, Priority
-from drivers.host.set_admission import SetAdmission
+from drivers.host.set_admission import SetAdmission, StagedSet
 from drivers.playing import AmplifierLayer, AmplifierTone, Playback
 from drivers.protocol.sets import Envelope
 from drivers.wires.can_frames import CanFrame, pack_frames
@@ -111,7 +111,7 @@ def test_set_of_more_than_127_parts_is_refused() -> None:
     layers = [AmplifierLayer(number, tones) for number in range(16)]
     can = {**capabilities(16), "layers": 16, "voices": 255, "set_words": 65535}
     admission = SetAdmission("a", Mock(is_complete=True))
-    refused = admission.refusal_of(layers, Ledger(WIDE, can), 0.0, set_time=0.0)
+    refused = admission.refusal_of(StagedSet(layers), Ledger(WIDE, can), 0.0, set_time=0.0)
     assert "a set must have at most 14859 words, got" in str(refused)
 
 

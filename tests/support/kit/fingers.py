@@ -45,7 +45,7 @@ from controller.play.slots import Slots
 from controller.sources.touch import Contact, Touch, TouchFrame
 from controller.sources.tuio_capture import RecordedDatagram
 from drivers.errors import CommandRefused, LinkError
-from drivers.playing import AmplifierLayer
+from drivers.host.set_admission import StagedSet
 from drivers.protocol.sets import LayerSet
 from examples.make_touches import tuio_datagram, write_capture
 from kit.chain import Chain, Position, set_chain
@@ -326,8 +326,8 @@ class Hands(Acted, Fingers):
         slots = self.controller.cycle.planner.slots
         check = slots.check
 
-        def refuse(asked: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
-            begun = [each for each in asked["main"] if not each.renew]
+        def refuse(asked: Mapping[str, StagedSet]) -> CommandRefused | None:
+            begun = [each for each in asked["main"].requested if not each.renew]
             if sum(any(tone.level for tone in each.tones) for each in begun) < least:
                 return check(asked)
             self.refusals.append(threads.now() - self.marked_at)
@@ -348,7 +348,7 @@ class Hands(Acted, Fingers):
             self.patch.undo()
             raise CommandRefused("not now")
 
-        self.patch.setattr(group, "apply", refuse)
+        self.patch.setattr(group, "play", refuse)
 
     def renews_not(self, layer: int) -> None:
         """Let a layer not be renewed any more."""

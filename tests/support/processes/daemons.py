@@ -38,6 +38,7 @@ from controller.daemon.daemon import Daemon
 from controller.process.daemon_process import SocketLock
 from controller.process.log import LogThread
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
+from drivers.host.set_admission import StagedSet
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import READINGS
@@ -626,7 +627,8 @@ async def playing(
         amplifier = await lines.amplifier(url, GuardLimits(40, 500, 1), name=url)
         await amplifier.open()
         await amplifier.arm(SESSION, watchdog)
-        await amplifier.stage(1, [AmplifierLayer(0, (tone,), ramp=0.0)], now=True)
+        layers = [AmplifierLayer(0, (tone,), ramp=0.0)]
+        await amplifier.stage(StagedSet(layers), 1, now=True)
         yield amplifier
     finally:
         await lines.close()

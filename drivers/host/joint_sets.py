@@ -134,47 +134,46 @@ class JointSets:
         amplifiers.sort(key=last_fed_at)
         lines = {amplifier.line for amplifier in amplifiers}
         self.is_on_several_lines = len(lines) > 1
+        sets_in_order = {amplifier: sets[amplifier.name] for amplifier in amplifiers}
         try:
-            return await self._play_on(amplifiers, sets, is_preempted)
+            return await self._play_on(sets_in_order, is_preempted)
         finally:
             self.is_on_several_lines = False
 
     async def _play_on(
         self,
-        amplifiers: Sequence[Amplifier],
-        sets: Mapping[str, StagedSet],
+        sets: Mapping[Amplifier, StagedSet],
         is_preempted: IsPreempted | None,
     ) -> SetOutcome:
-        """Stage, judge, commit and report a set; amplifiers: in the order of staging."""
+        """Stage, judge, commit and report sets; sets: in the order of staging."""
         epoch = self._members.epoch
         if self.token % _TOKENS_PER_CHECK == 0:
             await self._close_gaps()
-        is_silent = all(is_silence(amplifier_set.requested) for amplifier_set in sets.values())
+        is_silent = all(is_silence(staged.requested) for staged in sets.values())
         is_immediate = is_silent or len(sets) == 1
         began = threads.now()
         token = self.next_token()
         stagings = []
-        for amplifier in amplifiers:
+        for amplifier, staged in sets.items():
             staging = amplifier.stage(
-                sets[amplifier.name],
+                staged,
                 token,
                 now=is_immediate,
                 priority=Priority.SILENCE if is_silent else Priority.SET,
                 is_preempted=is_preempted,
             )
             stagings.append(staging)
-        replies = dict(zip(amplifiers, await outcomes(stagings), strict=True))
+        replies = dict(zip(sets, await outcomes(stagings), strict=True))
         reason = self._judge(replies, is_immediate=is_immediate, is_silent=is_silent)
-        staged_sets = _staged_sets(replies)
         if reason is None and not is_immediate:
             if is_preempted is not None and is_preempted():
                 reason = Overtaken(f"set {token} is preempted")
             else:
-                reason = await self._commit(token, staged_sets, epoch, began)
+                reason = await self._commit(token, sets, epoch, began)
         if reason is not None:
-            return await self._give_up(reason, amplifiers, began)
+            return await self._give_up(reason, sets, began)
         self.is_incomplete = False
-        return await self._report(token, staged_sets)
+        return await self._report(token, sets)
 
     def _judge(
         self,
@@ -221,7 +220,7 @@ class JointSets:
         return None
 
     async def _give_up(
-        self, reason: CommandRefused, amplifiers: Sequence[Amplifier], began: float
+        self, reason: CommandRefused, amplifiers: Iterable[Amplifier], began: float
     ) -> UnplayedSet:
         """Silence a set that came too late, if it may play; return it as unplayed.
 
@@ -305,17 +304,6 @@ class JointSets:
             token = self.next_token()
             stagings = [amplifier.stage(StagedSet(()), token, now=True) for amplifier in behind]
             await self._members.all(stagings)
-
-
-def _staged_sets(
-    replies: Mapping[Amplifier, StagedSet | BaseException],
-) -> dict[Amplifier, StagedSet]:
-    """Return the sets that amplifiers have staged."""
-    staged_sets = {}
-    for amplifier, reply in replies.items():
-        if isinstance(reply, StagedSet):
-            staged_sets[amplifier] = reply
-    return staged_sets
 
 
 def _may_play_since(began: float, amplifiers: Iterable[Amplifier]) -> bool:

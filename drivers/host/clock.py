@@ -224,8 +224,11 @@ class HeldClock:
 
     def lead(self, time: float) -> float:
         """Return how far it is ahead of the host's clock at a time [s]; 0 before it is read."""
-        unsteered_lead = self.fit_at(time).offset
-        return math.remainder(self._steered.add_to(unsteered_lead, time), CLOCK_TURN)
+        return self._with_steering(self.fit_at(time), time)
+
+    def _with_steering(self, fit: LeadFit, time: float) -> float:
+        """Return the lead of a fit at a time [s], with the steered lead."""
+        return math.remainder(self._steered.add_to(fit.offset, time), CLOCK_TURN)
 
     def scatter(self, time: float) -> float:
         """Return the standard error of its measured lead [s]; infinite if it must be read again."""
@@ -238,18 +241,28 @@ class HeldClock:
         armed, because it is steered to zero. is_common: whether the error is relative to others of
         its line that follow the same clock.
         """
-        if not self.can_be_steered or self.problem(time) in ("clock_jumped", "clock_unsettled"):
+        if not self._is_trusted(time):
             return math.inf
+        fit = self.fit_at(time)
         lead = 0.0
         if self._is_armed:
-            lead = self.lead(time) if off is None else off
+            lead = self._with_steering(fit, time) if off is None else off
         if not is_common:
-            measured = self.fit_at(time).error
+            measured = fit.error
         elif self.is_compared:
             measured = self._comparison.difference.at(time).error
         else:
             measured = 0.0
         return math.hypot(self._max_reading_error / math.sqrt(3), measured, lead)
+
+    def is_synchronized(self, time: float) -> bool:
+        """Whether its error at a time [s] is known."""
+        return self._is_trusted(time) and self.fit_at(time).error < math.inf
+
+    def _is_trusted(self, time: float) -> bool:
+        """Whether it can be steered, and has followed the host's clock until a time [s]."""
+        has_failed = self.problem(time) in ("clock_jumped", "clock_unsettled")
+        return self.can_be_steered and not has_failed
 
     def _has_jumped(self, time: float) -> bool:
         """Whether it has jumped a short time ago, and is not trusted at a time [s]."""
@@ -282,8 +295,8 @@ class HeldClock:
         if not self.can_be_steered:
             return 0
         is_trusted = not self._has_jumped(time)
-        lead = self.lead(time) if is_trusted else 0.0
         fit = self.fit_at(time)
+        lead = self._with_steering(fit, time) if is_trusted else 0.0
         leader = self._comparison.compared_leader
         if leader is not None:
             common_lead = leader.lead(time) if is_trusted else 0.0

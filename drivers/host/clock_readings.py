@@ -76,6 +76,8 @@ class ClockReadings:
     """The shortest exchange, less its bits [s]."""
     _kept: list[Reading]
     """The lowest reading of each part of the time window."""
+    _part: float
+    """Length of the parts [s]."""
     _latest: deque[Reading]
     """The latest readings, without their possible delays."""
 
@@ -85,6 +87,7 @@ class ClockReadings:
     def forget(self, time: float) -> None:
         """Drop all readings, as if the clock had never been read before this time [s]."""
         self._kept = []
+        self._part = _MIN_PART
         self._latest = deque(maxlen=_BULK)
         self.fit = LeadFit(time)
         self.is_doubted = False
@@ -170,21 +173,30 @@ class ClockReadings:
 
     def _keep(self, newest: Reading) -> None:
         """Keep the lowest reading of each part of the window, which ends with the newest one."""
-        recent = [reading for reading in self._kept if newest.time - reading.time <= _WINDOW]
+        while self._kept and newest.time - self._kept[0].time > _WINDOW:
+            del self._kept[0]
         part = _MIN_PART
-        while recent and newest.time - recent[0].time > _PARTS * part:
+        while self._kept and newest.time - self._kept[0].time > _PARTS * part:
             part *= 2
-        recent.append(newest)
-        self._kept = []
-        for reading in recent:
-            if self._kept:
-                last = self._kept[-1]
-                if reading.time // part == last.time // part:
-                    expected = last.lead + self.fit.rate * (reading.time - last.time)
-                    if reading.lead > expected + CLOCK_STEP / 2:
-                        continue
-                    self._kept.pop()
-            self._kept.append(reading)
+        former_part = self._part
+        self._part = part
+        if part > former_part:
+            kept = self._kept
+            self._kept = []
+            for reading in kept:
+                self._keep_in_part(reading)
+        self._keep_in_part(newest)
+
+    def _keep_in_part(self, reading: Reading) -> None:
+        """Keep a reading unless its part of the window has a lower one already."""
+        if self._kept:
+            last = self._kept[-1]
+            if reading.time // self._part == last.time // self._part:
+                expected = last.lead + self.fit.rate * (reading.time - last.time)
+                if reading.lead > expected + CLOCK_STEP / 2:
+                    return
+                self._kept.pop()
+        self._kept.append(reading)
 
     def _update_fit(self, time: float) -> None:
         """Fit the lead at a time [s], and check the fit against the latest readings."""

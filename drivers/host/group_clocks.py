@@ -84,7 +84,7 @@ class Clocks:
         uncompared_count = 0
         for name, amplifier in amplifiers.items():
             leads[name] = amplifier.clock.lead(now)
-            if amplifier.clock.error(now) < math.inf:
+            if amplifier.clock.is_synchronized(now):
                 synchronised_leads.append(leads[name])
                 uncompared_count += not amplifier.clock.is_compared
         is_common = len(self._members.lines) == 1 and uncompared_count == 1

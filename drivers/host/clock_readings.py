@@ -206,19 +206,20 @@ class ClockReadings:
         delay = self.shortest if len(kept) > 3 else kept[0].max_delay - self.reply_bits
         min_variance = (delay / len(kept) ** 2) ** 2 / 12 + MIN_ERROR**2
         fit, lowest_lead = fit_lower_half(kept, self.fit, time, min_variance)
+        shortest_exchange = self.min_exchange + self.reply_bits
         recent = kept[-RECENT:]
-        residuals = []
-        sure_residuals = []  # after subtraction of the possible delays
-        leads = current_leads(aged_leads_of(recent, time), fit.rate, fit.bend)
-        for (lead, _), reading in zip(leads, recent, strict=True):
-            residual = lead - fit.offset
-            residuals.append(residual)
-            sure_residuals.append(residual - self._excess_delay(reading))
+        leads = []
+        sure_leads = []  # after subtraction of the possible delays
+        for (lead, _), reading in zip(
+            current_leads(aged_leads_of(recent, time), fit.rate, fit.bend), recent, strict=True
+        ):
+            leads.append(lead)
+            sure_leads.append(lead - (reading.max_delay - shortest_exchange))
         # If even the recent readings that cannot be late are far above the fit, the clock was
         # moved, and the older readings are dropped.
-        if min(sure_residuals) > FAR / 2:
+        if min(sure_leads) - fit.offset > FAR / 2:
             del self._kept[:-RECENT]
-        error = max(fit.error, min(residuals))
+        error = max(fit.error, min(leads) - fit.offset)
         self.fit = self._centered(fit._replace(error=error), lowest_lead)
 
     def _centered(self, fit: LeadFit, lowest_lead: float) -> LeadFit:

@@ -102,14 +102,16 @@ def _moments(aged_leads: Sequence[tuple[float, float]]) -> _Moments:
     for lead, age in aged_leads:
         x = mean_age - age
         y = lead - mean_lead
-        xx += x**2
+        xx += x * x
         xy += x * y
-        yy += y**2
+        yy += y * y
+    mean_xx = xx / count
     zy = zz = 0.0
     for lead, age in aged_leads:
-        z = (mean_age - age) ** 2 - xx / count
+        x = mean_age - age
+        z = x * x - mean_xx
         zy += z * lead
-        zz += z**2
+        zz += z * z
     return _Moments(mean_lead, mean_age, xx, xy, yy, zy, zz)
 
 

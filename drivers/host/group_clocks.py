@@ -24,9 +24,9 @@ from drivers.host.requests import GRACE, Priority
 from drivers.protocol.definition import HEARTBEAT, has_feature
 
 # Errors of a clock [s]: a good clock does not lower a promise, a fair one by a tenth of a dB.
-_GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6
+_GOOD, _FAIR = 5e-6, 8e-6
 _MAX_LOAD = 0.2  # share of the line's time for readings between heartbeats
-_FAIR_INTERVAL = 0.01  # s; between readings of a fair clock; half of it for a poor one
+_MIN_INTERVAL = 0.01  # s; between readings of one clock
 _SETTLING = 0.2  # s; at most, for readings before clocks are needed
 _FRAME = 1e-3  # s; a USB frame; readings should cover all of its phases
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples cover a circle evenly
@@ -169,7 +169,7 @@ class Clocks:
             if line in self._marked:
                 self._compare(line_amplifiers, now)
                 # A Mark that waits for a reply would be sent in step with USB frames.
-                delay = self.later(_FAIR_INTERVAL + _busy_time(line_amplifiers))
+                delay = self.later(_MIN_INTERVAL + _busy_time(line_amplifiers))
                 loop.call_later(delay, line.submit, None, Priority.HEARTBEAT, "Mark", {})
             else:
                 unmarked[line] = line_amplifiers
@@ -229,9 +229,7 @@ def _worst_scatter(line_amplifiers: Sequence[Amplifier], now: float) -> float:
 
 def _reading_interval(scatter: float) -> float:
     """Return the interval between readings of a clock with a scatter above _GOOD [s]."""
-    if scatter > _POOR:
-        return _FAIR_INTERVAL / 2
-    return _FAIR_INTERVAL * max((_FAIR - _GOOD) / (scatter - _GOOD), 1.0)
+    return _MIN_INTERVAL * max((_FAIR - _GOOD) / (scatter - _GOOD), 1.0)
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:

@@ -35,7 +35,9 @@ from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.contact_tracker import ContactTracker
 from controller.sources.touch import Change, Contact, ContactKey, Touch, TouchFrame
 from drivers.host.group_states import GroupState
+from drivers.host.ledger import Ledger
 from drivers.opening import Lines
+from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command
@@ -276,6 +278,25 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat() -> None:
 
 PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, elsewhere=None)
 """Contents of 14 dB SL, and a click without a level of its own."""
+
+
+@in_virtual_time
+async def test_ledger_is_queried_once_for_the_set_of_a_touch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The worst case of a set is computed when it is planned, and not again when it is sent."""
+    admit = Ledger.admit
+    admissions: list[Sequence[AmplifierLayer]] = []
+
+    def record(ledger: Ledger, layers: Sequence[AmplifierLayer], *args: Any, **options: Any) -> Any:
+        admissions.append(layers)
+        return admit(ledger, layers, *args, **options)
+
+    monkeypatch.setattr(Ledger, "admit", record)
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.02)
+        assert len(fingers.committed) == len(admissions) == 1
 
 
 @in_virtual_time

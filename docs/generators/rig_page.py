@@ -8,7 +8,8 @@ from model.config.fields import Section
 from model.rig import plate_sections, sections
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.structure.attachments import FEET, FOOT_LOSS
-from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
+from model.structure.exciter import EXCITER_TYPES
+from model.structure.material import KNOWN_MATERIALS
 
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,

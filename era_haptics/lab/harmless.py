@@ -42,7 +42,8 @@ from model.finger import THRESHOLDS
 from model.rig.rig_file import example_rig_path
 from model.rig.sections import RigSection
 from model.spectral.plate_mesh import POLYNOMIALS
-from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
+from model.structure.exciter import EXCITER_TYPES
+from model.structure.material import KNOWN_MATERIALS
 
 HIDDEN = "hidden"
 

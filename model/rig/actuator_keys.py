@@ -44,8 +44,7 @@ from model.rig.key_types import (
     name_among,
     place_on,
 )
-from model.structure.exciter import Actuator, Exciter
-from model.structure.material import EXCITER_TYPES
+from model.structure.exciter import EXCITER_TYPES, Actuator, Exciter
 from model.structure.plate import Plate
 from model.structure.sources import Era, Gain, damping_from_ratio
 

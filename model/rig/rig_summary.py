@@ -15,8 +15,7 @@ from model.rig.actuator_keys import ExciterSection
 from model.rig.plate_sections import PLAIN_KEYS
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
-from model.structure.exciter import Exciter
-from model.structure.material import EXCITER_TYPES
+from model.structure.exciter import EXCITER_TYPES, Exciter
 from model.structure.plate import (
     AirGap,
     Bond,

@@ -116,11 +116,11 @@ def dynamic_stiffness(
         imaginary_moduli.append(modulus.imag)
     elastic = plate.stiffness(functions, real_moduli)
     lossy = plate.stiffness(functions, imaginary_moduli)
-    D: ComplexArray = np.asarray(elastic + 1j * lossy)
+    D: ComplexArray = elastic + 1j * lossy
     w = slice(0, functions.deflections)
     along = slice(functions.deflections, None)
     identity = np.eye(functions.size - functions.deflections)
-    D[along, along] -= omega**2 * along_mass(functions, plate.along_mass, identity)
+    D[along, along] -= omega**2 * along_mass(functions, plate.interface_mass, identity)
     D[w, w] -= omega**2 * plate.deflection_mass(functions)
     condensed = D[w, w] - _yielding(D, functions.deflections)
     gap = plate.plate.air_gap
@@ -129,14 +129,14 @@ def dynamic_stiffness(
     air = air_motion(functions, gap)
     G = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
     G -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
-    return np.asarray(condensed + G[w, w] - _yielding(G, functions.deflections))
+    return condensed + G[w, w] - _yielding(G, functions.deflections)
 
 
 def _yielding(D: ComplexArray, count: int) -> ComplexArray:
     """Decrease of the stiffness of the first unknowns because all others are free, (n, n)."""
     w = slice(0, count)
     free = slice(count, None)
-    return np.asarray(D[w, free] @ np.linalg.solve(D[free, free], D[free, w]))
+    return D[w, free] @ np.linalg.solve(D[free, free], D[free, w])
 
 
 _STEP = 1e-4  # of Poisson's ratio: exact to its square

@@ -113,7 +113,7 @@ class SpectralPlate:
         self.layers = layers_of(plate)
         self._corrections = shear_corrections(self.layers)
         self._motions = opposite_motions(self.layers)
-        self.along_mass = self._motions.T @ interface_mass(self.layers) @ self._motions
+        self.interface_mass = self._motions.T @ interface_mass(self.layers) @ self._motions
         moduli = [layer.modulus(middle) for layer in self.layers]
         section = section_of(self.layers, moduli, self._corrections)
         nx, ny = degrees
@@ -123,7 +123,7 @@ class SpectralPlate:
 
     def functions(self, parity: tuple[int, int]) -> ClassFunctions:
         """Functions of a symmetry class."""
-        return ClassFunctions(self._x, self._y, parity, len(self.along_mass))
+        return ClassFunctions(self._x, self._y, parity, len(self.interface_mass))
 
     def modes(
         self, parity: tuple[int, int], *, shift: float, cut: float, band: MaterialBand
@@ -197,8 +197,8 @@ class SpectralPlate:
         w = slice(0, functions.deflections)
         along = slice(functions.deflections, None)
         K = self.stiffness(functions, moduli)
-        follows = follow(functions, K, self.along_mass, shift)
-        rotary = follows.T @ along_mass(functions, self.along_mass, follows)
+        follows = follow(functions, K, self.interface_mass, shift)
+        rotary = follows.T @ along_mass(functions, self.interface_mass, follows)
         stiffness = K[w, w] + K[w, along] @ follows - shift * rotary
         mass = self.deflection_mass(functions) + rotary
         gap = self.plate.air_gap
@@ -229,7 +229,7 @@ class _ModalSpace:
         self._loss_factor = plate.plate.loss_factor
         w, u, a, start_count = self._real_modes(plate, functions, air, shift, count)
         modes = np.vstack([w, u])
-        along = along_mass(functions, plate.along_mass, u)
+        along = along_mass(functions, plate.interface_mass, u)
         plate_mass = w.T @ plate.deflection_mass(functions) @ w + u.T @ along
         air_mass = np.zeros_like(plate_mass)
         air_stiffness = air_mass
@@ -244,7 +244,7 @@ class _ModalSpace:
         def stiffness(moduli: Sequence[float]) -> FloatArray:
             """Return the stiffness in the basis; moduli: Young's modulus of each layer."""
             in_modes = modes.T @ (plate.stiffness(functions, moduli) @ modes)
-            return np.asarray(basis.T @ in_modes @ basis)
+            return basis.T @ in_modes @ basis
 
         layers = plate.layers
         self._soft = [layer for layer in layers if not layer.is_elastic]

@@ -30,7 +30,7 @@ summed over the shapes. Uniform pressure of a sealed gap, k = 0, has no flow.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -54,101 +54,49 @@ _MAX_LAYERS = 3  # boundary layers of a side
 _PIECES = (0.0, 1.5, 5.0, 14.0)  # of a boundary layer, over its decay
 
 
-@dataclass(frozen=True, eq=False)
 class EdgedFunctions:
     """Orthonormal functions of x in (0, length) [m], by parity: EVEN or ODD about the middle.
 
     Per parity: Legendre polynomials up to a degree, ascending, then boundary layers with these
-    decay constants [1/m] at both ends, orthogonalized.
+    decay constants [1/m] at both ends, orthogonalized. slope_products: by parity, integrals of f' g
+    over the length, f of the parity, g of the other, (n, m); slope_squares: integrals of f' g',
+    both of the parity, (n, n). points: points of the integrals [m] (q,).
     """
 
-    length: float
-    degree: int
-    decays: tuple[float, ...] = ()
+    def __init__(self, length: float, degree: int, decays: tuple[float, ...] = ()) -> None:
+        self.length = length
+        self.degree = degree
+        self.points, self._weights = _rule(length, degree, decays)
+        self._values = dict[int, FloatArray]()
+        slopes = dict[int, FloatArray]()
+        polynomials, polynomial_slopes = self._polynomials()
+        for parity in (EVEN, ODD):
+            of_parity = slice(first_degree(parity), None, 2)
+            functions = polynomials[:, of_parity], polynomial_slopes[:, of_parity]
+            if self.polynomial_count(parity):
+                for decay in decays:
+                    functions = self._with_layer(*functions, decay, parity)
+            self._values[parity], slopes[parity] = functions
+        weights = self._weights[:, None]
+        self.slope_products = dict[int, FloatArray]()
+        self.slope_squares = dict[int, FloatArray]()
+        for parity, f_slopes in slopes.items():
+            self.slope_products[parity] = f_slopes.T @ (weights * self._values[-parity])
+            self.slope_squares[parity] = f_slopes.T @ (weights * f_slopes)
 
     def polynomial_count(self, parity: int) -> int:
         """Number of polynomials of a parity; these are its first functions."""
-        if not self._has(parity):
-            return 0
-        return (self.degree - first_degree(parity)) // 2 + 1
+        return count_of(self.degree, parity)
 
     def count(self, parity: int) -> int:
         """Number of functions of a parity."""
         return int(self._values[parity].shape[1])
-
-    @cached_property
-    def slope_products(self) -> dict[int, FloatArray]:
-        """By parity: integrals of f' g over the length, f of the parity, g of the other, (n, m)."""
-        weights = self._weights[:, None]
-        return {
-            parity: self._slopes[parity].T @ (weights * self._values[-parity])
-            for parity in (EVEN, ODD)
-        }
-
-    @cached_property
-    def slope_squares(self) -> dict[int, FloatArray]:
-        """By parity: integrals of f' g' over the length, both of the parity, (n, n)."""
-        weights = self._weights[:, None]
-        return {parity: slopes.T @ (weights * slopes) for parity, slopes in self._slopes.items()}
 
     def polynomial_products(self, values: FloatArray, parity: int) -> FloatArray:
         """Integrals with the polynomials of a parity of functions at `points` (q, m), (n, m)."""
         polynomials = self._values[parity][:, : self.polynomial_count(parity)]
         return polynomials.T @ (self._weights[:, None] * values)
 
-    @property
-    def points(self) -> FloatArray:
-        """Points of the integrals [m] (q,)."""
-        return self._rule[0]
-
-    @property
-    def _weights(self) -> FloatArray:
-        return self._rule[1]
-
-    @cached_property
-    def _rule(self) -> tuple[FloatArray, FloatArray]:
-        """Points [m] and weights of the integrals, both (q,)."""
-        half = self.length / 2
-        edges = {0.0, half}
-        for decay in self.decays:
-            edges.update(piece / decay for piece in _PIECES if piece / decay < half)
-        ascending = np.array(sorted(edges))
-        sizes = np.diff(ascending)[:, None]
-        gauss_points, gauss_weights = leggauss(self.degree + 12)
-        x = (ascending[:-1, None] + sizes * (1 + gauss_points) / 2).ravel()
-        weights = (sizes * gauss_weights / 2).ravel()
-        both_halves = np.concatenate([x, self.length - x[::-1]])
-        return both_halves, np.concatenate([weights, weights[::-1]])
-
-    def _has(self, parity: int) -> bool:
-        return self.degree >= first_degree(parity)
-
-    @property
-    def _values(self) -> dict[int, FloatArray]:
-        return self._functions[0]
-
-    @property
-    def _slopes(self) -> dict[int, FloatArray]:
-        return self._functions[1]
-
-    @cached_property
-    def _functions(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
-        """Values and slopes at the points, by parity."""
-        polynomials, polynomial_slopes = self._polynomials
-        values = dict[int, FloatArray]()
-        slopes = dict[int, FloatArray]()
-        for parity in (EVEN, ODD):
-            of_parity = slice(first_degree(parity), None, 2)
-            values[parity] = polynomials[:, of_parity]
-            slopes[parity] = polynomial_slopes[:, of_parity]
-            if self._has(parity):
-                for decay in self.decays:
-                    values[parity], slopes[parity] = self._with_layer(
-                        values[parity], slopes[parity], decay, parity
-                    )
-        return values, slopes
-
-    @property
     def _polynomials(self) -> tuple[FloatArray, FloatArray]:
         """Values and slopes (q, degree + 1) of all polynomials at the points."""
         degrees = np.arange(self.degree + 1)
@@ -167,15 +115,14 @@ class EdgedFunctions:
 
         Unchanged if the functions represent the layers already.
         """
-        x, weights = self._rule
-        near = np.exp(-decay * x)
-        far = np.exp(-decay * (self.length - x))
+        near = np.exp(-decay * self.points)
+        far = np.exp(-decay * (self.length - self.points))
         layer = near + parity * far
         layer_slope = -decay * (near - parity * far)
-        root_weights = np.sqrt(weights)
+        root_weights = np.sqrt(self._weights)
         size = np.linalg.norm(root_weights * layer)
         for _ in range(2):  # once leaves rounding errors
-            shares = values.T @ (weights * layer)
+            shares = values.T @ (self._weights * layer)
             layer = layer - values @ shares
             layer_slope = layer_slope - slopes @ shares
         norm = np.linalg.norm(root_weights * layer)
@@ -183,6 +130,26 @@ class EdgedFunctions:
             return values, slopes
         with_layer = np.column_stack([values, layer / norm])
         return with_layer, np.column_stack([slopes, layer_slope / norm])
+
+
+def _rule(length: float, degree: int, decays: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Gauss points [m] and weights (q,) of integrals of functions with boundary layers."""
+    half = length / 2
+    ends = {0.0, half}
+    for decay in decays:
+        ends.update(piece / decay for piece in _PIECES if piece / decay < half)
+    ascending = np.array(sorted(ends))
+    sizes = np.diff(ascending)[:, None]
+    gauss_points, gauss_weights = leggauss(degree + 12)
+    x = (ascending[:-1, None] + sizes * (1 + gauss_points) / 2).ravel()
+    weights = (sizes * gauss_weights / 2).ravel()
+    both_halves = np.concatenate([x, length - x[::-1]])
+    return both_halves, np.concatenate([weights, weights[::-1]])
+
+
+def count_of(degree: int, parity: int) -> int:
+    """Number of polynomials of a parity up to a degree."""
+    return (degree - first_degree(parity)) // 2 + 1
 
 
 def first_degree(parity: int) -> int:
@@ -200,13 +167,7 @@ def deflections_by_class(
     length, width = sides
     evaluate = partial(_deflections, sides, degrees)
     basis = mean_over(evaluate, points, length=length, width=width)
-    sizes = list[int]()
-    for parities in CLASSES:
-        counts = [
-            (degree - first_degree(parity)) // 2 + 1
-            for degree, parity in zip(degrees, parities, strict=True)
-        ]
-        sizes.append(math.prod(counts))
+    sizes = [math.prod(map(count_of, degrees, parities)) for parities in CLASSES]
     return np.split(basis, np.cumsum(sizes[:-1]), axis=1)
 
 
@@ -264,20 +225,17 @@ class ClassFunctions:
     @property
     def of_w(self) -> tuple[int, int]:
         """Functions of the deflection along x and y."""
-        x_parity, y_parity = self.parity
-        return self.x.polynomial_count(x_parity), self.y.polynomial_count(y_parity)
+        return self.x.polynomial_count(self.parity[0]), self.y.polynomial_count(self.parity[1])
 
     @property
     def of_x(self) -> tuple[int, int]:
         """Functions of u_x along x and y."""
-        x_parity, y_parity = self.parity
-        return self.x.count(-x_parity), self.y.count(y_parity)
+        return self.x.count(-self.parity[0]), self.y.count(self.parity[1])
 
     @property
     def of_y(self) -> tuple[int, int]:
         """Functions of u_y along x and y."""
-        x_parity, y_parity = self.parity
-        return self.x.count(x_parity), self.y.count(-y_parity)
+        return self.x.count(self.parity[0]), self.y.count(-self.parity[1])
 
     @property
     def deflections(self) -> int:
@@ -335,7 +293,7 @@ def class_stiffness(
     ) -> FloatArray:
         """One part of the energy; powers of s of both sides in it."""
         factor = 1 if by_side is None else -powers[by_side]
-        return _product(factor * matrix, _product(along_x, along_y))
+        return np.kron(factor * matrix, np.kron(along_x, along_y))
 
     K = np.zeros((functions.size, functions.size))
     w_slopes_x = x.slope_squares[x_parity][:w_x, :w_x]
@@ -360,12 +318,6 @@ def class_stiffness(
     return K
 
 
-def _product(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Kronecker product of two matrices, as `numpy.kron`, without its checks."""
-    shape = len(left) * len(right), left.shape[1] * right.shape[1]
-    return (left[:, None, :, None] * right[:, None]).reshape(shape)
-
-
 def along_mass(functions: ClassFunctions, mass: FloatArray, forces: FloatArray) -> FloatArray:
     """Mass matrix of the displacements along the plate times columns (m, k): (m, k).
 
@@ -382,7 +334,7 @@ def along_mass(functions: ClassFunctions, mass: FloatArray, forces: FloatArray) 
 def follow(
     functions: ClassFunctions, stiffness: FloatArray, mass: FloatArray, shift: float
 ) -> FloatArray:
-    """Displacements along the plate under unit deflections, (m, deflections), by least energy.
+    """Displacements along the plate of least energy under unit deflections, (m, deflections).
 
     shift [rad²/s²]: times the mass, keeps the rigid motions along the plate at rest.
     """
@@ -390,8 +342,8 @@ def follow(
     along = stiffness[first:, first:].copy()
     u = slice(0, functions.along_x)
     v = slice(functions.along_x, None)
-    along[u, u] += shift * _product(mass, np.eye(math.prod(functions.of_x)))
-    along[v, v] += shift * _product(mass, np.eye(math.prod(functions.of_y)))
+    along[u, u] += shift * np.kron(mass, np.eye(math.prod(functions.of_x)))
+    along[v, v] += shift * np.kron(mass, np.eye(math.prod(functions.of_y)))
     factor = linalg.cho_factor(along, lower=True, overwrite_a=True, check_finite=False)
     return -linalg.cho_solve(factor, stiffness[first:, :first], check_finite=False)
 
@@ -428,15 +380,15 @@ def air_motion(functions: ClassFunctions, gap: AirGap) -> AirMotion:
     flows = wavenumbers > 0
     flow_wavenumbers = wavenumbers[flows]
     function_count = coupling.shape[1]
-    flow_count = int(flows.sum())
-    w = slice(0, function_count)
-    a = slice(function_count, function_count + flow_count)
-    stiffness = np.zeros((a.stop, a.stop))
-    stiffness[w, w] = coupling.T @ coupling / gap.depth
-    stiffness[a, w] = -flow_wavenumbers[:, None] * coupling[flows]
-    stiffness[w, a] = stiffness[a, w].T
-    stiffness[a, a] = np.diag(gap.depth * flow_wavenumbers**2)
-    inertia = np.concatenate([np.zeros(function_count), np.full(flow_count, gap.depth)])
+    flow_count = len(flow_wavenumbers)
+    by_deflection = -flow_wavenumbers[:, None] * coupling[flows]
+    stiffness = np.block(
+        [
+            [coupling.T @ coupling / gap.depth, by_deflection.T],
+            [by_deflection, np.diag(gap.depth * flow_wavenumbers**2)],
+        ]
+    )
+    inertia = np.repeat([0.0, gap.depth], [function_count, flow_count])
     return AirMotion(stiffness, inertia)
 
 

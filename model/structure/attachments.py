@@ -110,7 +110,7 @@ class PointLoad:
 
     def spring(self, omega: FloatArray) -> ComplexArray:
         """The term k (1 + i eta) of D [N/m], of the shape of omega [rad/s]."""
-        return np.asarray(self.stiffness * (1 + 1j * self.loss_factor * np.sign(omega)))
+        return self.stiffness * (1 + 1j * self.loss_factor * np.sign(omega))
 
 
 FootKind: TypeAlias = Literal["foam", "rubber"]

@@ -13,12 +13,14 @@ nearly the same at every frequency. A data sheet usually states the resonance of
 against the magnet, `free`. When glued to a plate the magnet moves, at f_m = f_s sqrt(m_s / M), m_s
 the moving mass in the data sheet.
 
+Known types are in model/data/exciters.toml, with the source of each value.
+
 Not modeled: amplitude dependence of stiffness and damping, heating of the coil (0.39 % of R_e per
 kelvin), eddy currents, rocking of the magnet.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self, TypeAlias, TypeVar
 
@@ -27,6 +29,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.errors import MAX_VALUE, InputError, expect_values
 from model.structure.attachments import InTime, PointLoad
+from model.structure.material import read_catalog
 from model.structure.sources import Era, Factor, Source
 
 _MAX_LAG = 0.1
@@ -126,7 +129,7 @@ class Exciter(Source):
     def force(self, omega: FloatArray) -> ComplexArray:
         """F = T Bl V / Z at full level on a plate that is held [N], its own gain included."""
         w = np.asarray(omega)
-        return np.asarray(self._share(w) * self._pull(w))
+        return self._share(w) * self._pull(w)
 
     def deviating(
         self, omega: FloatArray, stiffness: Factor, damping: Factor
@@ -136,7 +139,7 @@ class Exciter(Source):
         spring = self._spring(w, stiffness, damping)
         share = self._share(w, spring)
         by_voltage = share * self.force_factor / self._impedance(w)
-        return np.asarray(spring * share - w**2 * self.coil_mass), np.asarray(by_voltage)
+        return spring * share - w**2 * self.coil_mass, np.asarray(by_voltage)
 
     def base(self, omega: FloatArray) -> ComplexArray:
         """Motion Bl V / (Z omega² M) at full level, with which spring errors change the force.
@@ -147,7 +150,7 @@ class Exciter(Source):
         w = np.asarray(omega)
         if self.held:
             return np.zeros(w.shape, dtype=complex)
-        return np.asarray(self._pull(w) / (w**2 * self.magnet_mass))
+        return self._pull(w) / (w**2 * self.magnet_mass)
 
     @property
     def quality(self) -> float:
@@ -167,7 +170,7 @@ class Exciter(Source):
     def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
         """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
         share = self._share(np.asarray(omega))
-        return np.asarray(share.reshape(-1, *[1] * (moved.ndim - 1)) * moved)
+        return share.reshape(-1, *[1] * (moved.ndim - 1)) * moved
 
     def loosened(self, share: float) -> Self:
         """Return an exciter with a fraction of its dynamic stiffness, because of its glue, and less
@@ -199,7 +202,7 @@ class Exciter(Source):
 
         def by_spring(change: ComplexArray | float) -> tuple[ComplexArray, ComplexArray]:
             stiffness_change = share**2 * change
-            return np.asarray(stiffness_change), np.asarray(stiffness_change * base)
+            return np.asarray(stiffness_change), stiffness_change * base
 
         by_factor, of_force = by_spring(electric)
         return {
@@ -219,19 +222,19 @@ class Exciter(Source):
     ) -> ComplexArray:
         """S [N/m], of a suspension that is stiffer and damps more by factors."""
         lost = damping * self.damping + self.force_factor**2 / self._impedance(w)
-        return np.asarray(stiffness * self.stiffness + 1j * w * lost)
+        return stiffness * self.stiffness + 1j * w * lost
 
     def _share(self, w: FloatArray, spring: ComplexArray | None = None) -> ComplexArray:
         """T, for S [N/m] if given, else its own."""
         if self.held:
             return np.ones(w.shape, dtype=complex)
         inertia = w**2 * self.magnet_mass
-        return np.asarray(inertia / (inertia - (self._spring(w) if spring is None else spring)))
+        return inertia / (inertia - (self._spring(w) if spring is None else spring))
 
     def _pull(self, w: FloatArray) -> ComplexArray:
         """Force of the current of a coil that is held [N], at full level."""
         drive = self.voltage * self.gain(w / (2 * np.pi))
-        return np.asarray(self.force_factor / self._impedance(w) * drive)
+        return self.force_factor / self._impedance(w) * drive
 
 
 Actuator: TypeAlias = Era | Exciter
@@ -239,3 +242,45 @@ Actuator: TypeAlias = Era | Exciter
 
 OneKind = TypeVar("OneKind", Era, Exciter, Actuator)
 """Kind of actuator that a function takes and returns."""
+
+
+@dataclass(frozen=True)
+class SheetValue:
+    """Value in SI units with its source; with lowest and highest value if it is assumed."""
+
+    value: float
+    source: str = ""
+    assumed: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class ExciterType:
+    """Exciter type by name; note: information for buyers; values: by rig-file key."""
+
+    name: str
+    note: str
+    values: Mapping[str, SheetValue]
+
+    @property
+    def assumed(self) -> dict[str, tuple[float, float]]:
+        """Keys that no source gives, with the lowest and highest value that is likely."""
+        return {key: entry.assumed for key, entry in self.values.items() if entry.assumed}
+
+
+def _known_types() -> Iterator[ExciterType]:
+    """Yield the exciter types of the catalog."""
+    catalog = read_catalog("exciters.toml")
+    for row in catalog["exciters"]:
+        values = dict[str, SheetValue]()
+        for key, entry in row["values"].items():
+            if "assumed" in entry:
+                lowest, highest = entry["assumed"]
+                values[key] = SheetValue(entry["value"], assumed=(lowest, highest))
+            else:
+                source = catalog["sources"][entry["source"]] + entry.get("detail", "")
+                values[key] = SheetValue(entry["value"], source)
+        yield ExciterType(row["name"], row["note"], values)
+
+
+EXCITER_TYPES: Mapping[str, ExciterType] = {known.name: known for known in _known_types()}
+"""Known types by name; the resonance of each is `free`."""

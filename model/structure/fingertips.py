@@ -76,7 +76,7 @@ class Fingertip:
         total = pulp + phalanx
         # At omega = 0, a pulp and a joint without stiffness transmit no force.
         in_series = pulp * phalanx / np.where(total == 0, 1.0, total)
-        return np.asarray(in_series - w**2 * self.contact_mass)
+        return in_series - w**2 * self.contact_mass
 
     def scaled(self, factor: float) -> "Fingertip":
         """Scale the contact of the fingertip by a factor: its pulp and its contact mass.

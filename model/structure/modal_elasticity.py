@@ -53,7 +53,7 @@ class Dispersion:
 
 def loss_factors(plate: Plate, omega: FloatArray) -> FloatArray:
     """Loss factor of the plate at omega [rad/s], of its shape."""
-    return np.asarray(plate.loss_factor * _powers(plate, omega))
+    return plate.loss_factor * _powers(plate, omega)
 
 
 def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
@@ -65,7 +65,7 @@ def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
     with np.errstate(divide="ignore"):
         order = np.argsort(np.round(np.log(eigenvalues), 9), kind="stable")
     elastic = order[eigenvalues[order] > 0]
-    return np.asarray(elastic[:count])
+    return elastic[:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class ModalElasticity:
     def loss_factors(self, omega: FloatArray) -> FloatArray:
         """Loss factor of each mode at omega (f,) [rad/s], (f, r)."""
         of_modes = np.multiply.outer(_powers(self.plate, omega), self.relative_loss)
-        return np.asarray(self.plate.loss_factor * of_modes)
+        return self.plate.loss_factor * of_modes
 
     def stiffness(self, omega: FloatArray) -> ComplexArray:
         """Complex stiffness (1 + i eta) lambda of each mode at omega (f,), (f, r) [rad²/s²].
@@ -113,13 +113,13 @@ class ModalElasticity:
         With what soft layers and air add.
         """
         lossy = (1 + 1j * self.loss_factors(omega)) * self.eigenvalues
-        return np.asarray(lossy + self.further(omega))
+        return lossy + self.further(omega)
 
     def further(self, omega: FloatArray) -> ComplexArray:
         """What soft layers and air add to it at omega (f,), (f, r) or (r,) [rad²/s²]."""
         if self.dispersion is None:
             return np.asarray(1j * self.losses, dtype=complex)
-        return np.asarray(1j * self.losses + self.dispersion.at(omega))
+        return 1j * self.losses + self.dispersion.at(omega)
 
 
 WITHOUT_PART = (
@@ -182,7 +182,7 @@ def modal_receptance(
 
 def _powers(plate: Plate, omega: FloatArray) -> FloatArray:
     ratio = np.abs(omega) / (2 * np.pi * LOSS_FREQUENCY)
-    return np.asarray(ratio**plate.loss_exponent)
+    return ratio**plate.loss_exponent
 
 
 @dataclass(frozen=True)

@@ -467,7 +467,7 @@ def opposite_motions(layers: Sequence[LaminateLayer]) -> FloatArray:
     if tuple(layers) != tuple(layers)[::-1]:
         return np.eye(count)
     half = np.eye(count)[:, : count // 2]
-    return np.asarray((half - half[::-1]) / math.sqrt(2))
+    return (half - half[::-1]) / math.sqrt(2)
 
 
 def section_of(

@@ -181,11 +181,11 @@ class Era(Source):
 
     def base(self, omega: FloatArray) -> ComplexArray:
         """Amplitude of the base at full stroke [m] at omega [rad/s], its own gain included."""
-        return np.asarray(self.stroke * self.gain(omega / (2 * np.pi)))
+        return self.stroke * self.gain(omega / (2 * np.pi))
 
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
-        return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
+        return (self.stiffness + 1j * omega * self.damping) * self.base(omega)
 
     def loosened(self, share: float) -> Self:
         """Return the ERA with a share of its stiffness, and of its damping if that is below 1."""
@@ -201,8 +201,8 @@ class Era(Source):
         w = np.asarray(omega)
         base = self.base(w)
         by_stiffness = np.full(w.shape, self.stiffness, dtype=complex)
-        by_damping = np.asarray(1j * w)
-        by_mass = np.asarray(-(w**2) + 0j)
+        by_damping = 1j * w
+        by_mass = -(w**2) + 0j
         return {
             "stiffness": (by_stiffness, np.asarray(by_stiffness * base)),
             "damping": (by_damping, np.asarray(by_damping * base)),
@@ -237,5 +237,5 @@ def unit_accelerations(
     """
     stiffness = attached_stiffness(omega, sources, loads)
     each_alone = np.eye(stiffness.shape[1], len(sources))
-    applied = np.asarray(each_alone * drive_forces(omega, sources)[:, None])
-    return np.asarray(-(omega**2)[:, None, None] * moved(stiffness, applied))
+    applied = each_alone * drive_forces(omega, sources)[:, None]
+    return -(omega**2)[:, None, None] * moved(stiffness, applied)

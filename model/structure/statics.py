@@ -71,7 +71,7 @@ def static_loads(
     center = _rigid_shape(plate, *center_of_mass(plate))
     weight = GRAVITY * (p @ mass + plate.mass * center)
     q = np.linalg.solve((p * stiffness) @ p.T, weight)
-    return np.asarray((stiffness * (q @ p))[stiffness > 0])
+    return (stiffness * (q @ p))[stiffness > 0]
 
 
 def center_of_mass(plate: Plate) -> Point:
@@ -148,7 +148,7 @@ class Balance:
         """
         from scipy.spatial import ConvexHull  # slow to import
 
-        return np.asarray(ConvexHull(self.supports).equations)
+        return ConvexHull(self.supports).equations
 
     @property
     def inside(self) -> float:
@@ -205,4 +205,4 @@ def balance_of(plate: Plate, sources: Sequence[Source], loads: Sequence[PointLoa
 
 def _distances(edges: FloatArray, point: Point) -> FloatArray:
     """Distances [m] of a point to edges (e, 3), positive outside."""
-    return np.asarray(edges[:, :2] @ point + edges[:, 2])
+    return edges[:, :2] @ point + edges[:, 2]

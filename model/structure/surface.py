@@ -264,7 +264,7 @@ def _normals(nodes: FloatArray, axis: int) -> FloatArray:
     _, near = cKDTree(nodes).query(nodes, k=min(_BESIDE, len(nodes)))
     beside = nodes[near] - nodes[near].mean(axis=1, keepdims=True)
     normals = np.linalg.svd(beside)[2][:, 2]
-    return np.asarray(normals * np.where(normals[:, [axis]] < 0, -1.0, 1.0))
+    return normals * np.where(normals[:, [axis]] < 0, -1.0, 1.0)
 
 
 def _mass(rigid: FloatArray) -> float:
@@ -313,7 +313,7 @@ def is_within(outline: Rings, points: FloatArray) -> NDArray[np.bool_]:
             along = np.array([x1 - x0, y1 - y0])
             share = ((points - (x0, y0)) @ along / (along @ along or 1.0)).clip(0, 1)
             on_edge |= np.hypot(*(points - (x0, y0) - share[:, None] * along).T) < _ON_OUTLINE
-    return np.asarray(inside | on_edge)
+    return inside | on_edge
 
 
 def homogeneous(shapes: SurfaceShapes, mass: float | None) -> tuple[float, float, float]:

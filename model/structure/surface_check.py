@@ -209,7 +209,7 @@ def _on_raster(shapes: SurfaceShapes) -> _Motion:
     resolved = shapes.rigid + max(_NODES_PER_MODE, len(nodes) // _NODES_PER_MODE)
     values = np.hstack([shapes.shapes[chosen, :resolved], shapes.motions[chosen]])
     spline = RBFInterpolator(nodes, values, kernel="cubic", degree=2)
-    interpolated = np.asarray(spline(raster))
+    interpolated = spline(raster)
     bodies, _ = np.linalg.qr(interpolated[:, -3:])
     return _Motion(
         area,
@@ -314,7 +314,7 @@ def _normalization(modes: ModeShapes) -> str:
 
 def _is_same(values: FloatArray, value: FloatArray | float) -> NDArray[np.bool_]:
     """Whether positive values are the same apart from rounding."""
-    return np.asarray((np.abs(values - value) <= _SAME_VALUE * value) & (values > 0))
+    return (np.abs(values - value) <= _SAME_VALUE * value) & (values > 0)
 
 
 def _is_round(value: float) -> bool:

@@ -30,8 +30,8 @@ from model.rig.rig_file import example_rig_path, parse_rig, rig_of
 from model.rig.rig_summary import plate_summary
 from model.rig.rig_warnings import exciter_notes, resonance_notes
 from model.rig.rig_writing import document_for as keys_of
-from model.structure.exciter import Exciter
-from model.structure.material import EXCITER_TYPES, Material
+from model.structure.exciter import EXCITER_TYPES, Exciter
+from model.structure.material import Material
 from model.structure.plate import AirGap, Laminate, Plate
 from model.structure.statics import rigid_body_frequencies
 from model.transients.excursions import excursion_notes

@@ -1,6 +1,9 @@
 """Finite-element model of the plate: mesh, matrices, and natural modes.
 
-The mesh is a lattice of Reissner-Mindlin rectangles: MITC4 (the founding paper's) or Q3 to Q5.
+The mesh is a lattice of Reissner-Mindlin rectangles (Reissner, J. Appl. Mech. 12 (1945) A69;
+Mindlin, J. Appl. Mech. 18 (1951) 31): MITC4 (the founding paper's) or Q3 to Q5. With Young's
+modulus E, shear modulus G and thickness h, the flexural rigidity is D = E h³ / (12 (1 - nu²)), and
+the shear rigidity is S = kappa G h (`rigidities`).
 
 A function of the mesh is the product of a function of x and a function of y, and so is an integral
 over the plate (`ElementRow`). Thin plates do not lock with elements of the third order and above on
@@ -16,7 +19,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -51,13 +54,13 @@ class Element:
         return len(self.side) - 1
 
     def shape(self, xi: FloatArray) -> FloatArray:
-        """Lagrange polynomials of a side at xi (n,) in -1..1: (n, order + 1), rows sum to 1."""
+        """Lagrange polynomials N of a side at xi (n,) in -1..1: (n, order + 1), rows sum to 1."""
         return np.vander(xi, self.order + 1, increasing=True) @ self._coefficients()
 
     def integrals(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Integrals over -1..1 of N_i N_j, N_i' N_j and N_i' N_j', exact, (n, n) each.
+        """Integrals over -1..1 of N_i N_j, N_i' N_j, N_i' N_j' and R_i R_j, exact, (n, n) each.
 
-        Also the integrals of N_i N_j for rotations in shear; for MITC4, of their means.
+        R are the functions of rotations in shear: N, or the means of N for MITC4.
         """
         points, weights = legendre.leggauss(len(self.side))
         powers = np.arange(len(self.side))
@@ -66,8 +69,10 @@ class Element:
         shape = self.shape(points)
         weighted_slope = slope.T * weights
         value = (shape.T * weights) @ shape
-        means = value.sum(axis=1)
-        sheared = np.outer(means, means) / 2 if self.order == 1 else value
+        sheared = value
+        if self.order == 1:
+            means = value.sum(axis=1)
+            sheared = np.outer(means, means) / 2
         return value, weighted_slope @ shape, weighted_slope @ slope, sheared
 
     def _coefficients(self) -> FloatArray:
@@ -78,8 +83,8 @@ class Element:
 class ElementRow:
     """Elements in a row: nodes at `nodes` (n,) [m] between the ends of elements (m + 1,) [m].
 
-    integrals: by name, sparse (n, n), of functions "vv", of a slope and a function "sv" and "vs",
-    of slopes "ss", and of rotations in shear "rr".
+    integrals: sparse (n, n), by the functions of rows and columns: "N N", "N' N", "N N'", "N' N'"
+    and "R R", with a prime for slopes and R for rotations in shear (`Element.integrals`).
     """
 
     def __init__(self, element: Element, ends: FloatArray) -> None:
@@ -91,12 +96,12 @@ class ElementRow:
         self.nodes = np.append(nodes.ravel(), ends[-1])
         value, mixed, slope, sheared = element.integrals()
         self.integrals = {
-            "vv": self._assembled(value, sizes / 2),
-            "sv": self._assembled(mixed, np.ones(len(sizes))),
-            "ss": self._assembled(slope, 2 / sizes),
-            "rr": self._assembled(sheared, sizes / 2),
+            "N N": self._assembled(value, sizes / 2),
+            "N' N": self._assembled(mixed, np.ones(len(sizes))),
+            "N' N'": self._assembled(slope, 2 / sizes),
+            "R R": self._assembled(sheared, sizes / 2),
         }
-        self.integrals["vs"] = self.integrals["sv"].T.tocsr()
+        self.integrals["N N'"] = self.integrals["N' N"].T.tocsr()
 
     def numbers(self, cells: IntArray) -> IntArray:
         """Numbers of the nodes of elements (c,), (c, order + 1)."""
@@ -116,10 +121,8 @@ class ElementRow:
         numbers = self.numbers(np.arange(len(scales)))
         row, column = np.broadcast_arrays(numbers[:, :, None], numbers[:, None])
         values = (scales[:, None, None] * matrix).ravel()
-        places = (row.ravel(), column.ravel())
         size = len(self.nodes)
-        assembled = sparse.coo_array((values, places), shape=(size, size))
-        return sparse.csr_array(assembled)
+        return sparse.csr_array((values, (row.ravel(), column.ravel())), shape=(size, size))
 
 
 def _gauss_lobatto(order: int) -> tuple[float, ...]:
@@ -272,14 +275,13 @@ class Mesh(Discretization):
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
         """Return the largest relative error of its shape functions for a wave between nodes.
 
-        A polynomial of order p follows a wave k between nodes a step s apart within (k s)^(p + 1) /
-        4 (p + 1).
+        A polynomial of order p through nodes at most a step s apart represents a wave k within (k
+        s)^(p + 1) / (4 (p + 1)) (Heath, Scientific Computing, 2nd ed., chapter 7).
         """
         order = self.element.order
         step = max(self.element_size) / order
         wavenumber = 2 * math.pi / plate.bending_wavelength(frequency)
-        phase = wavenumber * step
-        return float(phase ** (order + 1) / (4 * (order + 1)))
+        return float((wavenumber * step) ** (order + 1) / (4 * (order + 1)))
 
     def interpolation(self, points: FloatArray) -> sparse.csr_array:
         """Shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.
@@ -302,28 +304,42 @@ class Mesh(Discretization):
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 
-_ENERGY = (
-    ("ww", "shear_x", "vv", "ss"),
-    ("ww", "shear_y", "ss", "vv"),
-    ("wx", "-shear_x", "vv", "sv"),
-    ("wy", "-shear_y", "sv", "vv"),
-    ("xx", "shear_x", "vv", "rr"),
-    ("xx", "bending_x", "vv", "ss"),
-    ("xx", "twist", "ss", "vv"),
-    ("yy", "shear_y", "rr", "vv"),
-    ("yy", "bending_y", "ss", "vv"),
-    ("yy", "twist", "vv", "ss"),
-    ("xy", "coupled", "vs", "sv"),
-    ("xy", "twist", "sv", "vs"),
-)
-"""Stiffness between w and the rotations x and y: fields, rigidity, integrals along y and along x.
 
-Slopes s, functions v, rotations r in shear (paper Eq. 17).
-"""
+class _EnergyTerm(NamedTuple):
+    """Term of the stiffness between two fields: w, or the rotations x and y."""
+
+    fields: str
+    """Fields of rows and columns."""
+    rigidity: str
+    """Rigidity by which the integrals are multiplied."""
+    along_x: str
+    """Integral along x, as in `ElementRow.integrals`."""
+    along_y: str
+    sign: int = 1
+
+
+_ENERGY = (
+    _EnergyTerm("ww", "shear_x", "N' N'", "N N"),
+    _EnergyTerm("ww", "shear_y", "N N", "N' N'"),
+    _EnergyTerm("wx", "shear_x", "N' N", "N N", -1),
+    _EnergyTerm("wy", "shear_y", "N N", "N' N", -1),
+    _EnergyTerm("xx", "shear_x", "R R", "N N"),
+    _EnergyTerm("xx", "bending_x", "N' N'", "N N"),
+    _EnergyTerm("xx", "twist", "N N", "N' N'"),
+    _EnergyTerm("yy", "shear_y", "N N", "R R"),
+    _EnergyTerm("yy", "bending_y", "N N", "N' N'"),
+    _EnergyTerm("yy", "twist", "N' N'", "N N"),
+    _EnergyTerm("xy", "coupled", "N' N", "N N'"),
+    _EnergyTerm("xy", "twist", "N N'", "N' N"),
+)
+"""Strain energy of bending and shear (paper Eq. 17)."""
 
 
 def rigidities(plate: Plate) -> dict[str, float]:
-    """Bending, coupled and twist [N m], and shear [N/m] of a plate's section (paper Eq. 5 to 7)."""
+    """Bending, coupled and twist [N m], and shear [N/m] of a plate's section (paper Eq. 5 to 7).
+
+    bending: D; coupled: nu D; twist: G h³ / 12, between the rotations; shear: S = kappa G h.
+    """
     material = plate.material
     shares = material.shares
     h = plate.thickness
@@ -379,7 +395,7 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
     density = plate.surface_density
     rotary = density * plate.thickness**2 / 12
     along_x, along_y = mesh.along
-    value = sparse.kron(along_y.integrals["vv"], along_x.integrals["vv"])
+    value = sparse.kron(along_y.integrals["N N"], along_x.integrals["N N"])
     mass = sparse.kron(value, np.diag([density, rotary, rotary]))  # paper Eq. 19 and 20
     return PlateMatrices(
         plate=plate,
@@ -400,22 +416,20 @@ def _stiffness(
     """
     along_x, along_y = mesh.along
     blocks: dict[str, Any] = {}
-    for fields, rigidity, integral_y, integral_x in _ENERGY:
-        factor = section[rigidity.removeprefix("-")]
-        if rigidity.startswith("-"):
-            factor = -factor
+    for term in _ENERGY:
+        factor = term.sign * section[term.rigidity]
         if by_side is not None:
-            integral = integral_x if by_side == "x" else integral_y
-            factor *= -(fields.count(by_side) + integral.count("s"))
-        part = sparse.kron(along_y.integrals[integral_y], along_x.integrals[integral_x])
-        blocks[fields] = blocks.get(fields, 0) + factor * part
+            integral = term.along_x if by_side == "x" else term.along_y
+            factor *= -(term.fields.count(by_side) + integral.count("'"))
+        part = sparse.kron(along_y.integrals[term.along_y], along_x.integrals[term.along_x])
+        blocks[term.fields] = blocks.get(term.fields, 0) + factor * part
     stiffness: Any = 0
     for fields, block in blocks.items():
-        row_field, column_field = fields[0], fields[1]
-        place = np.zeros((DOF_PER_NODE, DOF_PER_NODE))
-        place["wxy".index(row_field), "wxy".index(column_field)] = 1
-        addend = sparse.kron(block, place, format="csc")
-        if row_field != column_field:
+        row, column = map("wxy".index, fields)
+        between_fields = np.zeros((DOF_PER_NODE, DOF_PER_NODE))
+        between_fields[row, column] = 1
+        addend = sparse.kron(block, between_fields, format="csc")
+        if row != column:
             addend = addend + addend.T
         stiffness = stiffness + addend
     return sparse.csc_array(stiffness)
@@ -426,8 +440,8 @@ def simply_supported_modes(
 ) -> tuple[FloatArray, FloatArray]:
     """Natural frequencies (n,) [Hz], ascending, and undamped modes (dof, n) of modal mass 1.
 
-    All four edges have no deflection and free rotation. Raises InputError for a count above the
-    mesh's number of modes.
+    The deflection of all four edges is zero, and their rotation is free. Raises InputError for a
+    count above the mesh's number of modes.
     """
     mesh = matrices.mesh
     at_loads = matrices.deflection_at(footprints_of(loads))

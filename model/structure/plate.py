@@ -1,17 +1,17 @@
-"""Touch plate: materials, layers, the air behind it, and bending stiffness.
+"""Touch plate: its layers, the air behind it, its bending stiffness, and its equivalent plate.
 
-Defines, in this order: sheet, laminate, air gap, plate; then the stiffness of a laminate's section,
-its bending waves, and its equivalent homogeneous plate.
+In this order: sheet, laminate, air gap, plate; then the stiffness of a laminate's section, its
+bending waves, and its equivalent homogeneous plate.
 
-Laminates, such as cover glass on adhesive on a panel. Every layer bends, stretches and shears
+Every layer of a laminate (such as cover glass on adhesive on a panel) bends, stretches and shears
 individually. Displacements along the plate are continuous from layer to layer and linear within
 each (a layerwise theory of first order: Reddy, Mechanics of Laminated Composite Plates and Shells,
 2nd ed., ch. 12); the deflection is the same through the thickness. Soft adhesives between stiff
 layers then shear as Kerwin (J. Acoust. Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound Vib.
-10 (1969) 163) predict, more the shorter the wave. With stiff adhesives it becomes
-classical laminate theory. Layers may also be laid loosely (`Bond.NONE`) and slide on each other
-without friction. Bonded layers are solved individually (`model.spectral.modes`), loose layers and
-single layers as the homogeneous plate, which also gives wavelengths, meshes and estimates.
+10 (1969) 163) predict: more, the shorter the wave. With stiff adhesives it becomes classical
+laminate theory. Loose layers (`Bond.NONE`) slide on each other without friction. Bonded layers are
+solved individually (`model.spectral.modes`); loose layers and single layers as the homogeneous
+plate, which also gives wavelengths, meshes and estimates.
 
 Air in a narrow gap behind the plate flows along it. In the low reduced frequency model (Zwikker and
 Kosten 1949; Beltman, J. Sound Vib. 227 (1999) 555) the pressure is constant across the gap, the
@@ -21,12 +21,13 @@ flow profile follows from viscosity, and the temperature from conduction to both
     1 / b = 1 - tanh(s) / s,               s = (d / 2) sqrt(iωρ / mu),
     1 / B = (1 + (gamma - 1) tanh(t) / t) / (gamma p0),    t = (d / 2) sqrt(iωρ cp / k)
 
-with the mean velocity v over the depth d and the plate's deflection w away from the gap. Slow, b
-becomes 12 mu / (iωρ d²) + 6/5, the squeeze film of Reynolds' equation, and air is isothermal; fast,
-b = 1, and it is adiabatic. Holds while the gap is narrow compared with waves and with the plate.
+with the mean velocity v over the depth d and the plate's deflection w away from the gap. In slow
+motion, b is 12 mu / (iωρ d²) + 6/5, the squeeze film of Reynolds' equation, and the air is
+isothermal; in fast motion b = 1, and it is adiabatic. The model holds while the gap is narrow
+compared with waves and with the plate.
 
-Not modeled: layers that change their thickness, as a foam does under a force at a point; change of
-an adhesive with temperature; air between loose layers.
+Not modeled: a change of thickness of layers, for example of foam under a force at a point; change
+of an adhesive with temperature; air between loose layers.
 """
 
 import cmath
@@ -71,10 +72,10 @@ class Sheet:
         """
         return math.sqrt(self.material.shares.e2) * self._along
 
-    def rigidity_towards(self, cos2: "FloatArray | float") -> "FloatArray | float":
-        """Flexural rigidity [N m] of straight waves, by the squared cosine of their direction.
+    def rigidity_towards(self, cos2: FloatArray | float) -> FloatArray | float:
+        """Flexural rigidity [N m] of straight waves, by the squared cosine c² of their direction.
 
-        To the length: D1 c⁴ + 2 (nu12 D2 + 2 D12) c² s² + D2 s⁴.
+        D1 c⁴ + 2 (nu12 D2 + 2 D12) c² s² + D2 s⁴, with the direction relative to the length.
         """
         d1, mixed, d2 = self._rigidities
         sin2 = 1 - cos2
@@ -86,18 +87,20 @@ class Sheet:
         d1, mixed, d2 = self._rigidities
         if mixed >= min(d1, d2):
             return min(d1, d2)
-        return (d1 * d2 - mixed**2) / (d1 - 2 * mixed + d2)  # between both sides
+        return (d1 * d2 - mixed**2) / (d1 - 2 * mixed + d2)  # in an oblique direction
 
     @property
     def _along(self) -> float:
+        """D1 [N m], along the length."""
         return self.material.E * self.thickness**3 / (12 * self.material.plane_stress)
 
     @property
     def _rigidities(self) -> tuple[float, float, float]:
-        """D1, nu12 D2 + 2 D12, and D2."""
-        of, own = self.material, self._along
-        twist = of.shares.g12 * of.plane_stress
-        return own, own * (of.nu * of.shares.e2 + 2 * twist), own * of.shares.e2
+        """D1, nu12 D2 + 2 D12, and D2 [N m]."""
+        material = self.material
+        shares = material.shares
+        mixed = material.nu * shares.e2 + 2 * (shares.g12 * material.plane_stress)
+        return self._along, self._along * mixed, self._along * shares.e2
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ class LaminateLayer(Sheet):
     """
 
     def __post_init__(self) -> None:
-        """Refuse a thickness that is not above zero, and rows that state no modulus."""
+        """Reject a thickness that is not above zero, and rows without a valid modulus."""
         expect_values(self, "layer", above="thickness")
         previous = 0.0
         for frequency, factor, loss in self.by_frequency:
@@ -129,17 +132,18 @@ class LaminateLayer(Sheet):
 
     def modulus(self, frequency: float) -> complex:
         """E (1 + i eta) [Pa] at a frequency [Hz]."""
-        if not self.by_frequency:
-            return self.material.E * (1 + 1j * self.loss_factor)
         rows = self.by_frequency
-        if len(rows) == 1:
-            ((_, factor, loss),) = rows
-            return self.material.E * factor * (1 + 1j * loss)
-        after = min(max(bisect_left(rows, (frequency,)), 1), len(rows) - 1)
-        (f0, factor0, loss0), (f1, factor1, loss1) = rows[after - 1], rows[after]
-        share = min(max(math.log(frequency / f0) / math.log(f1 / f0), 0.0), 1.0)
-        factor = factor0 * math.pow(factor1 / factor0, share)
-        return self.material.E * factor * (1 + 1j * (loss0 + share * (loss1 - loss0)))
+        if not rows:
+            return self.material.E * (1 + 1j * self.loss_factor)
+        above = bisect_left(rows, (frequency,))
+        low, low_factor, low_loss = rows[max(above - 1, 0)]
+        high, high_factor, high_loss = rows[min(above, len(rows) - 1)]
+        share = 0.0
+        if low < frequency <= high:
+            share = math.log(frequency / low) / math.log(high / low)
+        factor = low_factor * math.pow(high_factor / low_factor, share)
+        loss = low_loss + share * (high_loss - low_loss)
+        return self.material.E * factor * (1 + 1j * loss)
 
     @property
     def is_elastic(self) -> bool:
@@ -155,14 +159,15 @@ class Laminate:
     bond: Bond = Bond.FULL
 
     def __post_init__(self) -> None:
-        """Refuse a laminate without layers, and losses of layers that slide."""
+        """Reject a laminate without layers, with a grain, or with losses in layers that slide."""
         if not self.layers:
             raise InputError("laminate: must have at least one layer")
-        if grained := [each.material.name for each in self.layers if each.material.orthotropy]:
-            raise InputError(
-                f"laminate: layers must be isotropic, got {grained[0]}; give a board by thickness "
-                "and material of the plate"
-            )
+        for layer in self.layers:
+            if layer.material.orthotropy:
+                raise InputError(
+                    f"laminate: layers must be isotropic, got {layer.material.name}; give a board "
+                    "by thickness and material of the plate"
+                )
         if self.bond is Bond.NONE and not all(layer.is_elastic for layer in self.layers):
             raise InputError(
                 "laminate: layers must be without loss_factor and by_frequency with bond none; "
@@ -181,31 +186,23 @@ class Laminate:
 
     def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Laminate":
         """The laminate with all moduli and all thicknesses times a factor."""
-        layers = (
-            replace(
-                layer,
-                material=replace(layer.material, E=modulus * layer.material.E),
-                thickness=thickness * layer.thickness,
-            )
-            for layer in self.layers
-        )
+        layers = list[LaminateLayer]()
+        for layer in self.layers:
+            material = replace(layer.material, E=modulus * layer.material.E)
+            scaled = replace(layer, material=material, thickness=thickness * layer.thickness)
+            layers.append(scaled)
         return replace(self, layers=tuple(layers))
 
 
 # Dry air at 20 °C and 101325 Pa (Lemmon and Jacobsen, Int. J. Thermophys. 25 (2004) 21): density
 # [kg/m³], viscosity [Pa s], thermal conductivity [W/(m K)], heat capacity [J/(kg K)], its ratio.
 PRESSURE = 101_325.0
-_DENSITY, VISCOSITY, CONDUCTIVITY, HEAT_CAPACITY, HEAT_RATIO = (
-    1.204,
-    18.2e-6,
-    25.9e-3,
-    1006.0,
-    1.402,
-)
+_DENSITY, VISCOSITY, CONDUCTIVITY = 1.204, 18.2e-6, 25.9e-3
+HEAT_CAPACITY, HEAT_RATIO = 1006.0, 1.402
 
 # Depth [thicknesses of the boundary layer] down to which friction hardly couples modes, and down to
-# which by some 10 %: responses of the paper's plate and of a panel over 10 um to 10 mm, solved in
-# modes and at each frequency.
+# which the coupling changes the response by some 10 %: measured on responses of the paper's plate
+# and of a panel over 10 um to 10 mm, solved in modes and at each frequency.
 _OPEN, _SEALED = (5.0, 1.4), (1.0, 0.28)
 
 
@@ -218,19 +215,21 @@ class AirGap:
     """Whether it is sealed along all edges; otherwise it is open along all edges."""
 
     def __post_init__(self) -> None:
-        """Refuse a depth that is not above zero."""
+        """Reject a depth that is not above zero."""
         expect_values(self, "air gap", above="depth")
 
     def coupling_error(self, frequency: float) -> float:
-        """Lower bound of the response error from neglecting the coupling of modes by friction [-].
+        """Estimated relative error of the response without the coupling of modes by friction.
 
-        At a frequency [Hz], by thicknesses of the boundary layer sqrt(2 mu / (rho omega)): within 3
-        % over a deeper open gap, 5 % over a deeper sealed one, where it is 0 here; then 10 %, and
-        in a gap too narrow for modes half of the response and more.
+        It depends on the depth at a frequency [Hz] in thicknesses sqrt(2 mu / (rho omega)) of the
+        boundary layer. 0 for a deep gap, whose error is within 3 % (sealed: 5 %); then 0.1; 0.5 for
+        a gap too narrow for modes, whose error is half of the response and more.
         """
-        layers = self.depth / math.sqrt(VISCOSITY / (math.pi * _DENSITY * frequency))
-        within, modal = _SEALED if self.closed else _OPEN
-        return 0.0 if layers >= within else 0.1 if layers >= modal else 0.5
+        relative_depth = self.depth / math.sqrt(VISCOSITY / (math.pi * _DENSITY * frequency))
+        deep, modal = _SEALED if self.closed else _OPEN
+        if relative_depth >= deep:
+            return 0.0
+        return 0.1 if relative_depth >= modal else 0.5
 
     def inertia(self, frequency: float) -> complex:
         """rho b [kg/m³] at a frequency [Hz]: density of air that friction holds back."""
@@ -324,7 +323,7 @@ class Plate(Sheet):
     """
 
     def __post_init__(self) -> None:
-        """Refuse dimensions out of range."""
+        """Reject values out of range."""
         expect_values(self, "plate", above="length width thickness")
         expect_between(self.loss_factor, 0, MAX_LOSS_FACTOR, what="plate: loss_factor")
         expect_between(
@@ -419,6 +418,11 @@ FIELDS_BESIDE_THEORY = tuple(
 """Fields of a plate that leave the modes of its theory as they are."""
 
 _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
+_EXACT, _CONVERGED = 1e-12, 1e-6  # relative changes in a step: that end it, that are sufficient
+
+
+# 6 / h times the integrals of products of two linear functions over the thickness h of a layer.
+_LINEAR = np.array([[2.0, 1.0], [1.0, 2.0]])
 
 
 @dataclass(frozen=True)
@@ -428,7 +432,7 @@ class Bending:
     rigidity: float  # D [N m]
     nu: float
     bonded: float = 1.0
-    """How little its layers slide on each other, 0 to 1."""
+    """1 for layers without slip, 0 for layers that slide without friction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,11 +454,14 @@ class CrossSection:
 
     def in_motions(self, motions: FloatArray) -> "CrossSection":
         """The section in k motions of the interfaces, each a column (n + 1, k)."""
-        stretch, across, twist, slip = (
-            motions.T @ each @ motions
-            for each in (self.stretch, self.across, self.twist, self.slip)
+        return CrossSection(
+            stretch=motions.T @ self.stretch @ motions,
+            across=motions.T @ self.across @ motions,
+            twist=motions.T @ self.twist @ motions,
+            slip=motions.T @ self.slip @ motions,
+            lever=self.lever @ motions,
+            shear=self.shear,
         )
-        return CrossSection(stretch, across, twist, slip, self.lever @ motions, self.shear)
 
 
 def opposite_motions(layers: Sequence[LaminateLayer]) -> FloatArray:
@@ -475,15 +482,16 @@ def section_of(
 ) -> CrossSection:
     """Section of layers with these Young's moduli [Pa]; corrections: of `shear_corrections`."""
     size = len(layers) + 1
-    across, twist = (np.zeros((size, size), dtype=complex) for _ in range(2))
-    stretch, slip = (np.zeros((2, size, size), dtype=complex) for _ in range(2))
+    across, twist = np.zeros((2, size, size), dtype=complex)
+    stretch, slip = np.zeros((2, 2, size, size), dtype=complex)
     lever = np.zeros((2, size), dtype=complex)
     shear = np.zeros(2, dtype=complex)
     ends = np.array([-1.0, 1.0])
     for number, (layer, modulus, kappa) in enumerate(zip(layers, moduli, corrections, strict=True)):
-        shares, h = layer.material.shares, layer.thickness
-        own = slice(number, number + 2)
-        linear = h / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
+        h = layer.thickness
+        shares = layer.material.shares
+        own = slice(number, number + 2)  # the interfaces of the layer
+        linear = h / 6 * _LINEAR
         plane = modulus / layer.material.plane_stress
         across[own, own] += layer.material.nu * shares.e2 * plane * linear
         twist[own, own] += shares.g12 * modulus * linear
@@ -499,18 +507,17 @@ def interface_mass(layers: Sequence[LaminateLayer]) -> FloatArray:
     """Mass per area [kg/m²] of displacements along the plate at the interfaces, (n + 1, n + 1)."""
     mass = np.zeros((len(layers) + 1, len(layers) + 1))
     for number, layer in enumerate(layers):
-        mass[number : number + 2, number : number + 2] += (
-            layer.surface_density / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
-        )
+        own = slice(number, number + 2)
+        mass[own, own] += layer.surface_density / 6 * _LINEAR
     return mass
 
 
 def slide_frequency(laminate: Laminate, frequency: float) -> float:
-    """Lowest frequency [Hz] at which bonded layers slide to and fro on each other by themselves.
+    """Lowest natural frequency [Hz] of bonded layers that slide on each other without bending.
 
-    Everywhere alike, without a deflection, by the moduli at a frequency [Hz]. Of two faces of m''
-    on a light core of G and h: sqrt(2 G / (h m'')) / 2 pi; they change their distance in the same
-    way, with the modulus of compression in place of G.
+    With the moduli at a frequency [Hz]. For two faces of mass m'' per area on a light core of G and
+    h it is sqrt(2 G / (h m'')) / (2 pi). The distance of the faces vibrates in the same way, with
+    the modulus of compression in place of G.
     """
     layers = laminate.layers
     moduli = [layer.modulus(frequency).real for layer in layers]
@@ -545,8 +552,8 @@ def perfectly_bonded(layers: Sequence[LaminateLayer]) -> Bending:
     """Layers without slip: D* = D - B A⁻¹ B of classical laminate theory.
 
     Jones, Mechanics of Composite Materials, 2nd ed., ch. 4; the reduction is Ashton's, J. Compos.
-    Mater. 3 (1969) 189. For isotropic layers A, B and D share their eigenvectors, so the matrices
-    fall apart into equal bending both ways, modulus E / (1 - nu), and opposite, E / (1 + nu).
+    Mater. 3 (1969) 189. For isotropic layers A, B and D have the same eigenvectors: equal bending
+    in both directions, with the modulus E / (1 - nu), and opposite bending, with E / (1 + nu).
     """
     E, nu, h, z = _columns(layers)
 
@@ -554,7 +561,8 @@ def perfectly_bonded(layers: Sequence[LaminateLayer]) -> Bending:
         A, B, D = np.array([np.ones(len(z)), z, h**2 / 12 + z**2]) @ (moduli * h)
         return float(D - B**2 / A)
 
-    equal, opposite = reduced(E / (1 - nu)), reduced(E / (1 + nu))
+    equal = reduced(E / (1 - nu))
+    opposite = reduced(E / (1 + nu))
     return Bending((equal + opposite) / 2, (equal - opposite) / (equal + opposite))
 
 
@@ -571,37 +579,45 @@ def wave_rigidity(laminate: Laminate, wavenumber: complex, frequency: float) -> 
     The displacements at the interfaces take the least energy: k⁴ D = k² shear - k² lever (k²
     stretch + slip)⁻¹ lever.
     """
-    layers, k2 = laminate.layers, wavenumber**2
+    layers = laminate.layers
+    k2 = wavenumber**2
     if laminate.bond is Bond.NONE:
         return freely_sliding(layers).rigidity + 0j
     moduli = [layer.modulus(frequency) for layer in layers]
     section = section_of(layers, moduli, shear_corrections(layers))
-    stretch, slip, lever = section.stretch[0], section.slip[0], section.lever[0]
-    moved = np.linalg.solve(k2 * stretch + slip, lever)
-    return complex((section.shear[0] - lever @ moved) / k2)
+    lever = section.lever[0]
+    displacements = np.linalg.solve(k2 * section.stretch[0] + section.slip[0], lever)
+    return complex((section.shear[0] - lever @ displacements) / k2)
 
 
 def wavenumber_of(laminate: Laminate, frequency: float) -> complex:
     """k [1/m] of the free bending wave of a frequency [Hz], D(k) k⁴ = m'' omega².
 
     Rotary inertia is left out. Complex with losses: a wave exp(-i k x) then decays, k has a
-    negative imaginary part.
+    negative imaginary part. Raises InputError if the iteration does not converge; since D falls at
+    most as k^-2, each step at least halves the error.
     """
     inertia = laminate.surface_density * (2 * math.pi * frequency) ** 2
-    better = complex((inertia / freely_sliding(laminate.layers).rigidity) ** 0.25)
+    k = complex((inertia / freely_sliding(laminate.layers).rigidity) ** 0.25)
     for _ in range(_MAX_STEPS):
-        k = better
-        better = (inertia / wave_rigidity(laminate, k, frequency)) ** 0.25
-        if abs(better - k) < 1e-12 * abs(k):
+        last_k = k
+        k = (inertia / wave_rigidity(laminate, last_k, frequency)) ** 0.25
+        change = abs(k - last_k) / abs(last_k)
+        if change < _EXACT:
             break
-    return better
+    if not change < _CONVERGED:  # also NaN
+        raise InputError(
+            f"laminate: its wave at {frequency:g} Hz must converge in {_MAX_STEPS} steps, got a "
+            f"relative change of {change:.2g} in the last one; check the moduli of its layers"
+        )
+    return k
 
 
 def _columns(
     layers: Sequence[LaminateLayer],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Moduli [Pa], Poisson's ratios, thicknesses, and heights of the middles above the face [m]."""
-    rows = [(each.material.E, each.material.nu, each.thickness) for each in layers]
+    rows = [(layer.material.E, layer.material.nu, layer.thickness) for layer in layers]
     moduli, nu, thickness = np.array(rows).T
     return moduli, nu, thickness, np.cumsum(thickness) - thickness / 2
 
@@ -622,8 +638,8 @@ def equivalent_plate(
     length, width [m]. It keeps the laminate if its layers are solved individually, i.e. unless they
     slide or there is a single elastic layer.
     """
-    first, *further = laminate.layers
-    if not further and first.is_elastic:
+    first = laminate.layers[0]
+    if len(laminate.layers) == 1 and first.is_elastic:
         return Plate(length, width, first.thickness, first.material, loss_factor)
     plate = _homogeneous(laminate, bending(laminate, frequency), length, width, loss_factor)
     if laminate.bond is Bond.NONE:
@@ -641,7 +657,8 @@ def short_wave_plate(plate: Plate, wavenumber: float, frequency: float) -> Plate
 
 
 def _bending_at(laminate: Laminate, wavenumber: float, frequency: float) -> Bending:
-    bonded, sliding = perfectly_bonded(laminate.layers), freely_sliding(laminate.layers)
+    bonded = perfectly_bonded(laminate.layers)
+    sliding = freely_sliding(laminate.layers)
     rigidity = wave_rigidity(laminate, wavenumber, frequency).real
     gain = bonded.rigidity - sliding.rigidity
     share = (rigidity - sliding.rigidity) / gain if gain > 1e-9 * rigidity else 0.0
@@ -655,7 +672,7 @@ def _homogeneous(
 ) -> Plate:
     """The plate of a rigidity with the laminate's mass and rotary inertia."""
     density = laminate.surface_density
-    # Each layer turns about its own middle and moves lengthwise, the latter as far as it is bonded.
+    # Each layer rotates about its own middle, and moves along the plate as far as it is bonded.
     E, nu, h, z = _columns(laminate.layers)
     stiffness = E * h / (1 - nu**2)
     off_neutral = bent.bonded * (z - stiffness @ z / stiffness.sum())

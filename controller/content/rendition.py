@@ -90,8 +90,14 @@ class Rendition:
             texture = _texture(shares, step, self.modulation_hz)
         shares = averaged(shares - texture, step, SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
-        course = Course(self.course.times, array("d", np.clip(shares, 0, 1)))
+        course = replace(self.course, shares=array("d", np.clip(shares, 0, 1)))
         return replace(smoothed, course=course)
+
+    def looped(self) -> "Rendition":
+        """Return the rendition of a file that repeats."""
+        if self.course is None:
+            return self
+        return replace(self, course=replace(self.course, repeats=True))
 
 
 def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:

@@ -97,6 +97,8 @@ class File(Effect):
         if level_db_sl not in self._renditions:
             level = MAX_DB_SL if level_db_sl is None else level_db_sl
             alone = rendered(self._pattern, level, np.array(self._frequencies))
+            if self.loop:
+                alone = alone.looped()
             self._renditions[level_db_sl] = _Renditions(alone, alone.smoothed())
         return self._renditions[level_db_sl]
 

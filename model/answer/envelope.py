@@ -51,6 +51,12 @@ Weights suppress ringing only for this time: with 20 ms it was up to 7 dB strong
 four ERAs, and 18 dB on a large table.
 """
 
+_REPEATED = 0.5
+"""Time [s] after the first turn for which a repeating course is predicted.
+
+From then on, the plate's response changes by less than half a decibel.
+"""
+
 _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
 """Step [s] of pulses, and maximum number of steps within the duration."""
 
@@ -68,6 +74,8 @@ class Course:
     """Times [s], ascending from 0 to the duration."""
     shares: Sequence[float]
     """Fraction at each time, 0 to 1; linear in between."""
+    repeats: bool = False
+    """Whether it starts again at its end, for as long as the finger stays."""
 
     def __post_init__(self) -> None:
         """Check times and fractions; raises InputError."""
@@ -95,6 +103,11 @@ class Course:
         """Sampling interval [s]."""
         return _STEP if self.duration > _SHORT else _STEP / 2
 
+    @property
+    def predicted_time(self) -> float:
+        """Time [s] for which it is predicted: one turn, and more turns if it repeats."""
+        return self.duration + (_REPEATED if self.repeats else 0.0)
+
     @cached_property
     def strongest_db(self) -> float:
         """RMS of its strongest moments [dB], relative to a constant 1."""
@@ -107,6 +120,13 @@ class Course:
 
     def _energy_until(self, times: FloatArray) -> FloatArray:
         """Return the integral of the squared fraction from 0 to times [s] (n,)."""
+        if not self.repeats:
+            return self._energy_of_turn(times)
+        turns, rest = np.divmod(times, self.duration)
+        return turns * self._energy_of_turn(np.array(self.duration)) + self._energy_of_turn(rest)
+
+    def _energy_of_turn(self, times: FloatArray) -> FloatArray:
+        """Return the integral of the squared fraction of one playback, as `_energy_until`."""
         knots, shares = self._line
         products = shares[:-1] ** 2 + shares[:-1] * shares[1:] + shares[1:] ** 2
         until_knot = np.append(0.0, np.cumsum(np.diff(knots) * products / 3))
@@ -134,13 +154,17 @@ class Course:
         return tuple(swings)
 
     def played(self, times: FloatArray) -> FloatArray:
-        """Return fractions (n,) at times [s] as amplifiers play them once, from knot to knot.
+        """Return fractions (n,) at times [s] as amplifiers play them, from knot to knot.
 
-        They begin at silence, which the first knot ends, and return to it after the last knot.
+        They begin at silence, which the first knot ends, and return to it after the last knot:
+        after one playback, or after `predicted_time` if it repeats.
         """
-        knot_count = math.ceil(self.duration / COURSE_KNOT_STEP)
+        knot_count = math.ceil(self.predicted_time / COURSE_KNOT_STEP)
         knots = np.asarray(COURSE_KNOT_STEP * np.arange(1, knot_count + 1), dtype=float)
         shares = self._played_at(knots)
+        if self.repeats:
+            repeated = self.at(np.mod(knots, self.duration))
+            shares = np.where(knots < self.predicted_time, repeated, 0.0)
         fractions = np.interp(times, np.append(0.0, knots), np.append(0.0, shares), right=0.0)
         return np.asarray(fractions)
 
@@ -238,7 +262,7 @@ class DriveEnvelope:
     @classmethod
     def of_course(cls, course: Course) -> "DriveEnvelope":
         """Build the envelope of a course as it is played."""
-        count = math.ceil((course.duration + _RINGING) / course.step)
+        count = math.ceil((course.predicted_time + _RINGING) / course.step)
         times = np.asarray(course.step * np.arange(count), dtype=float)
         values = course.played(times)
         within = round(STRONGEST / course.step)

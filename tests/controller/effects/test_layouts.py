@@ -310,9 +310,12 @@ def test_times_count_from_when_the_amplifiers_have_started() -> None:
 
 
 def test_a_loop_has_its_clicks_in_every_turn() -> None:
-    """At 0.2 and 0.6 s of each second, for as long as the finger stays."""
+    """At 0.2 and 0.6 s of each second, for as long as the finger stays; its course repeats, too."""
     player = player_of(it=file_of(loop=True))
     play(player, 0.0)
+    course = felt(player, 0.0)[False].course
+    assert course is not None
+    assert course.repeats
     pulses = [
         targets[True].pulse
         for now in np.arange(0.0, 60.0, 0.01)

@@ -130,6 +130,18 @@ class MassSection(Section):
 class SupportSection(Section):
     """Passive foot under the plate, or support along its edges."""
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {
+                    "required": ["at"],
+                    "anyOf": [{"required": ["kind"]}, {"required": ["stiffness"]}],
+                },
+                {"required": ["along", "stiffness_per_length"]},
+            ]
+        }
+    )
+
     at: Place | None = None
     """`[x, y]`, on the plate.
 

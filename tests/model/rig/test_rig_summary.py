@@ -384,6 +384,18 @@ def test_show_prints_exciters_and_what_they_reach(
         ({"base": "rig.yaml", "plate": {"thickness": True}}, False),
         ({"base": "rig.yaml", "eras": {"SW": {"stifness": 1.0}}}, False),
         ({"base_fingerprint": "f0"}, False),
+        ({"supports": {"a": {"at": [0, 0], "kind": "foam", "stiffness": 3000}}}, True),
+        ({"supports": {"a": {"along": "edges", "stiffness_per_length": 3000}}}, True),
+        ({"supports": {"a": {"at": [0, 0]}}}, False),
+        (
+            {
+                "supports": {
+                    "a": {"at": [0, 0], "kind": "foam", "along": "edges", "stiffness_per_length": 1}
+                }
+            },
+            False,
+        ),
+        ({"base": "rig.yaml", "supports": {"a": {"stiffness": 3000}}}, True),
     ],
 )
 def test_schema_knows_whole_rigs_and_fitted_ones(keys: dict[str, Any], is_good: bool) -> None:

@@ -49,7 +49,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
 def _add_reach(summary: dict[str, Any], rig: "Rig") -> None:
     """Add the levels that exciters reach, and the excursions of their magnets, to a summary."""
     from model.reduction.free_plate import solve_free_plate
-    from model.transients.excursions import excursions_of, reach_of
+    from model.transients.excursions import excursions_of
+    from model.transients.reach import reach_of
 
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
     summary["reach"] = reach_of(rig, free).as_json()

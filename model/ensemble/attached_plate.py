@@ -44,6 +44,7 @@ from functools import cached_property, lru_cache
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.ensemble.draws import standard_normal
@@ -140,17 +141,17 @@ class AttachedPlate(Mounts):
         return int(self.forces.shape[1])
 
     def of_thicknesses(
-        self, deviations: FloatArray, of_modes: FloatArray, row: int
+        self, deviations: FloatArray, mode_deviations: FloatArray, row: int
     ) -> tuple[Complex64Array, Complex64Array]:
         """Return g for plates of several thicknesses at a row of the frequencies, (d, r) [s²/kg].
 
         Also its change by one standard deviation of the loss factor. deviations (d,): of the
-        plates' frequencies, of_modes (2, r, d): of each mode's own frequency and size, both in
-        standard deviations.
+        plates' frequencies; mode_deviations (2, r, d): of each mode's own frequency and size; both
+        in standard deviations.
         """
         uncertainty = self.uncertainty
         modal = self.modal[row]
-        mode_frequencies, mode_amplitudes = of_modes
+        mode_frequencies, mode_amplitudes = mode_deviations
         v = np.maximum(1 + uncertainty.mode_frequency * mode_frequencies.T, LEAST_THICKNESS)
         v_squared = v**2
         # The amplitude of rigid-body modes follows from the plate's known mass.
@@ -315,7 +316,7 @@ class PlateOnEras:
         f, b = plate.stiffness.shape
         r = plate.shapes.shape[1]
         t = len(deviations)
-        of_modes = np.concatenate([mode_numbers(r, len(group)) for group in groups], axis=2)
+        mode_deviations = np.concatenate([mode_numbers(r, len(group)) for group in groups], axis=2)
         result = cls(
             plate=plate,
             first=first,
@@ -326,7 +327,7 @@ class PlateOnEras:
             moved=np.empty((f, t, b, plate.era_count), dtype=np.complex64),
         )
         for row in range(f):
-            receptance, by_loss = plate.of_thicknesses(deviations, of_modes, row)
+            receptance, by_loss = plate.of_thicknesses(deviations, mode_deviations, row)
             by_force, coupling, moved = _eliminated(plate, row, receptance)
             result.receptance[row] = receptance
             result.by_loss[row] = by_loss
@@ -361,7 +362,7 @@ def _eliminated(
 
 
 def with_places(
-    on: PlateOnEras, shifts: FloatArray, gram: Float32Array, by_field: Sequence[bool]
+    plates: PlateOnEras, shifts: FloatArray, gram: Float32Array, by_field: Sequence[bool]
 ) -> tuple[PlateOnEras, FloatArray]:
     """Include position errors of the sources in a plate, as larger errors of their stiffness.
 
@@ -370,46 +371,53 @@ def with_places(
     sources per standard deviation along x and y; gram (r, r): mean product of the shapes where
     fingers rest; by_field (n,): whether couples count as errors of the field.
     """
-    plate = on.plate
+    plate = plates.plate
     n = plate.era_count
-    deformation = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELED, :n]
-    by_unit_force = np.linalg.norm(on.by_force[:, MODELED, :n], axis=2)
+    deformation = np.eye(n) * plate.strokes[:, None] - plates.moved[:, MODELED, :n]
+    by_unit_force = np.linalg.norm(plates.by_force[:, MODELED, :n], axis=2)
     by_unit_stiffness = by_unit_force * np.linalg.norm(deformation, axis=2)
     changes = np.empty_like(by_unit_stiffness)
     field_errors = np.empty_like(by_unit_stiffness)
+    counts_for_field = np.array(by_field)
     for row in range(len(changes)):
-        changes[row], field_errors[row] = _by_places(on, row, shifts, gram, np.array(by_field))
+        change, field_error = _misplacement(plates, row, shifts, gram, counts_for_field)
+        changes[row] = change
+        field_errors[row] = field_error
     by_stiffness = plate.by_stiffness.copy()
     by_spring = plate.by_stiffness[:, :n]
     size = np.hypot(np.abs(by_spring), changes / by_unit_stiffness)
     by_stiffness[:, :n] = size * np.exp(1j * np.angle(by_spring))
     displaced = replace(plate, by_stiffness=by_stiffness)
-    return replace(on, plate=displaced), field_errors
+    return replace(plates, plate=displaced), field_errors
 
 
-def _by_places(
-    on: PlateOnEras, row: int, shifts: FloatArray, gram: Float32Array, by_field: np.ndarray
+def _misplacement(
+    plates: PlateOnEras,
+    row: int,
+    shifts: FloatArray,
+    gram: Float32Array,
+    by_field: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how much places that are off change all fields together, as stiffness does, (n,).
+    """Return the change (n,) of all fields by the position errors of each source, at a row.
 
-    In accelerations of the reduced coordinates [m/s²], at a row of the frequencies; and the mean
-    square (n,) of the error of each field that remains.
+    Norms of the accelerations of the reduced coordinates [m/s²], without the part of the couples'
+    fields that no stiffness error covers; and the mean square (n,) of that part in each field.
     """
-    plate = on.plate
+    plate = plates.plate
     n = plate.era_count
     w2 = plate.minus_omega2[row]
     Z = plate.stiffness[row]
-    T = on.by_force[row, MODELED]
-    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELED, :n]
-    free = on.receptance[row, MODELED] * shifts
-    held = ((free @ plate.shapes.T) * Z) @ T
-    couples = np.asarray(w2 * free - held)  # (n, 2, r), by 1 N
+    T = plates.by_force[row, MODELED]
+    forces = np.diag(plate.forces[row]) - Z[:n, None] * plates.moved[row, MODELED, :n]
+    free = plates.receptance[row, MODELED] * shifts
+    prevented = ((free @ plate.shapes.T) * Z) @ T
+    couples = np.asarray(w2 * free - prevented)  # (n, 2, r), by 1 N
     by_force = T[:n, None]
     along = by_force.conj() @ gram
     share = (along * couples).sum(axis=2) / (along * by_force).sum(axis=2)
     field_errors = np.zeros_like(couples)
     field_errors[by_field] = (couples - share[..., None] * by_force)[by_field]
-    tilts = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
+    tilts = Z[:n, None, None] * (shifts @ (plates.fields[row] / w2).T)  # (n, 2, n)
     by_couples = forces[:, None, :, None] * (couples - field_errors)[:, :, None]
     changes = by_couples - tilts[..., None] * by_force[:, :, None]
     squares = np.vecdot(field_errors, field_errors @ gram).real.sum(axis=1)

@@ -208,7 +208,7 @@ class ClockErrors:
 
         Empty if all are synchronized. A content plays on the ERAs of a single group.
         """
-        alone = [number for number, each in enumerate(self.errors) if each > MAX_HELD]
+        alone = [number for number, error in enumerate(self.errors) if error > MAX_HELD]
         if not alone:
             return ()
         has_synchronized = len(alone) < len(self.errors)

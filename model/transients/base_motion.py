@@ -76,12 +76,11 @@ def along_lines(
     # Computed once: rounded differently, ends and starts would overlap or leave samples out.
     moments = [start + number * step for number in range(len(values))]
     factors = [cmath.exp(1j * omega * number * step) for number in range(len(values))]
-    terms = [
-        Term(since, until, omega, factor * here, factor * (there - here) / step)
-        for (since, until), (here, there), factor in zip(
-            pairwise(moments), pairwise(values), factors[:-1], strict=True
-        )
-    ]
+    terms = list[Term]()
+    for number, (value, next_value) in enumerate(pairwise(values)):
+        factor = factors[number]
+        slope = factor * (next_value - value) / step
+        terms.append(Term(moments[number], moments[number + 1], omega, factor * value, slope))
     if values[-1] != 0:
         terms.append(Term(moments[-1], math.inf, omega, factors[-1] * values[-1]))
     return tuple(terms)
@@ -96,29 +95,30 @@ class BaseMotions:
 
     def __init__(self, *sets: Sequence[Motion], since: float = -math.inf) -> None:
         """Collect the terms of sets, each with the motion of every base, that end after `since`."""
-        terms = [
-            (number, era, *term)
-            for number, motions in enumerate(sets)
-            for era, motion in enumerate(motions)
-            for term in motion
-            if term.end > since
-        ]
-        *reals, c0, c1 = zip(*terms, strict=True) if terms else ((),) * 7
-        columns = np.array(reals, dtype=float)
-        order = np.argsort(columns[4], kind="stable")
+        terms = list[Term]()
+        bases = list[tuple[int, int]]()
+        for number, motions in enumerate(sets):
+            for era, motion in enumerate(motions):
+                lasting = [term for term in motion if term.end > since]
+                terms += lasting
+                bases += [(number, era)] * len(lasting)
+        order = np.argsort([term.omega for term in terms], kind="stable").astype(np.intp)
         self._moments: dict[int, list[float]] = {}
-        number, era, self.start, self.end, self.omega = columns[:, order]
-        self.number, self.era = number.astype(np.intp), era.astype(np.intp)
-        self.c0: ComplexArray = np.array(c0, dtype=complex)[order]
-        self.c1: ComplexArray | None = np.array(c1, dtype=complex)[order] if any(c1) else None
+        self.number, self.era = np.array(bases, dtype=np.intp).reshape(-1, 2)[order].T
+        times = np.array([term[:3] for term in terms], dtype=float).reshape(-1, 3)
+        self.start, self.end, self.omega = times[order].T
+        self.c0: ComplexArray = np.array([term.c0 for term in terms], dtype=complex)[order]
+        self.c1: ComplexArray | None = None
+        if any(term.c1 for term in terms):
+            self.c1 = np.array([term.c1 for term in terms], dtype=complex)[order]
 
     def moments(self, number: int, since: float, until: float) -> list[float]:
         """Times [s] after since and up to until at which terms of a set start or end, ascending."""
         moments = self._moments.get(number)
         if moments is None:
             is_of_set = self.number == number
-            each = self.start[is_of_set].tolist() + self.end[is_of_set].tolist()
-            moments = self._moments[number] = sorted({*each})
+            moments = sorted({*self.start[is_of_set].tolist(), *self.end[is_of_set].tolist()})
+            self._moments[number] = moments
         return moments[bisect_right(moments, since) : bisect_right(moments, until)]
 
     def active(self, numbers: ArrayLike, times: ArrayLike) -> NDArray[np.bool_]:
@@ -160,7 +160,7 @@ class BaseEnvelope:
 
     def scaled(self, factor: float) -> "BaseEnvelope":
         """Return the envelope with all amplitudes multiplied by a factor."""
-        knots = tuple([factor * each for each in self.knots])
+        knots = tuple([factor * knot for knot in self.knots])
         return replace(self, start=factor * self.start, knots=knots)
 
     def amplitude(self, times: FloatArray) -> ComplexArray:
@@ -220,10 +220,14 @@ def _faded(
     start: float = 0.0,
 ) -> Bases:
     """Return the bases' motion from one gain of an excitation to another, from start [s] on."""
-    found: list[tuple[Term, ...]] = [()] * len(eras)
-    for number, era in enumerate(eras):
-        if tone := excitation.get(era.name):
-            omega = 2 * math.pi * tone.frequency
-            now = tone.phasor * cmath.exp(1j * omega * start)
-            found[number] = raised_cosine(start, ramp, omega, *(gain * now for gain in gains))
-    return tuple(found)
+    bases = list[tuple[Term, ...]]()
+    for era in eras:
+        tone = excitation.get(era.name)
+        if tone is None:
+            bases.append(())
+            continue
+        omega = 2 * math.pi * tone.frequency
+        phasor = tone.phasor * cmath.exp(1j * omega * start)
+        first, last = gains
+        bases.append(raised_cosine(start, ramp, omega, first * phasor, last * phasor))
+    return tuple(bases)

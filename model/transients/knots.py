@@ -262,8 +262,9 @@ def hat_accelerations(
     """
     s = 1j * omega
     times = step * (np.arange(steps * samples) + 0.5) / samples
-    a1, a0 = (each[0] / step for each in plate.following(np.array([s])))
-    b0, b1 = a0 @ plate.displacement.T, a1 @ plate.displacement.T
+    _, a0, a1 = _ramp(plate, s, step)
+    b0 = a0 @ plate.displacement.T
+    b1 = a1 @ plate.displacement.T
     forced = s**2 * (b0 + times[:, None, None] * b1) + 2 * s * b1
     exponentials = np.exp(np.outer(times, plate.eigenvalues - s))
     free = np.stack([exponentials @ (plate.acceleration * row).T for row in a0], axis=1)
@@ -274,6 +275,15 @@ def hat_accelerations(
     return np.asarray(hats)
 
 
+def _ramp(
+    plate: PlateInTime, s: complex, step: float
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Return the steady state, a0 and a1 (eras, 2 r) of a linear ramp by each ERA."""
+    responses, by_s = plate.following(np.array([s]))
+    steady = responses[0]
+    return steady, by_s[0] / step, steady / step
+
+
 def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) -> ComplexArray:
     """Return the state z (2 r, steps, eras) at the end of an ending, at full stroke.
 
@@ -281,8 +291,7 @@ def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) 
     step 1, 2, ...
     """
     s = 1j * omega
-    steady, slope = (each[0] for each in plate.following(np.array([s])))
-    a0, a1 = slope / step, steady / step
+    steady, a0, a1 = _ramp(plate, s, step)
     times = step * np.arange(steps + 1)
     decay = np.exp(np.outer(times, plate.eigenvalues - s))
     linear_ramps = a0 + times[:, None, None] * a1 - decay[:, None] * a0
@@ -320,20 +329,22 @@ def bounded_minimum(
     orthonormal. Returns knots (k, eras): the unbounded solution if it is within the bounds, else
     that of alternating directions (ADMM: Boyd and others, 2011, section 5), always within them.
     """
-    unit, size = np.eye(len(form)), float(form.diagonal().real.mean())
-    to_knots, back = combinations.T, combinations.conj()
+    unit = np.eye(len(form))
+    size = float(form.diagonal().real.mean())
+    to_combinations = combinations.conj()
 
-    def solved(inverse: _ComplexArray, right: _ComplexArray) -> _ComplexArray:
-        return (inverse @ right.ravel()).reshape(right.shape) @ to_knots
+    def knots_by(inverse: _ComplexArray, right: _ComplexArray) -> _ComplexArray:
+        return (inverse @ right.ravel()).reshape(right.shape) @ combinations.T
 
-    found = solved(np.linalg.inv(form + _RIDGE * size * unit), right)
-    feasible = _within(found)
-    if feasible is not found:
+    unbounded = knots_by(np.linalg.inv(form + _RIDGE * size * unit), right)
+    feasible = _within(unbounded)
+    if feasible is not unbounded:
         penalty = PENALTY * size
         inverse = np.linalg.inv(form + (_RIDGE * size + penalty) * unit)
-        offset, dual = solved(inverse, right), np.zeros_like(feasible)
+        offset = knots_by(inverse, right)
+        dual = np.zeros_like(feasible)
         for _ in range(ITERATIONS):
-            knots = offset + penalty * solved(inverse, (feasible - dual) @ back)
+            knots = offset + penalty * knots_by(inverse, (feasible - dual) @ to_combinations)
             relaxed = RELAXATION * knots + (1 - RELAXATION) * feasible + dual
             feasible = _within(relaxed)
             dual = relaxed - feasible
@@ -353,67 +364,75 @@ _QUIET_WEIGHT = 0.03
 
 
 def onset_knots(
-    amplitudes: ComplexArray, found: FingerResponses, gain_variance: float
+    amplitudes: ComplexArray, responses: FingerResponses, gain_variance: float
 ) -> ComplexArray:
     """Find start and knots (1 + ONSET_KNOTS, eras) in strokes, from rest to amplitudes (eras,).
 
-    found: responses to these ERAs.
+    responses: to these ERAs.
     """
     knots = np.zeros((1 + ONSET_KNOTS, len(amplitudes)), dtype=complex)
     knots[-1] = amplitudes
-    given = ShapedTone(gain_variance=gain_variance, weight=TARGET_WEIGHT)
-    if not _found_by_kernel(knots, given, amplitudes, found, is_ending=False):
-        knots[1:-1] = onset_by_numpy(amplitudes, found, gain_variance)
+    tone = ShapedTone(gain_variance=gain_variance, weight=TARGET_WEIGHT)
+    if not _solved_by_kernel(knots, tone, amplitudes, responses, is_ending=False):
+        knots[1:-1] = onset_by_numpy(amplitudes, responses, gain_variance)
     return knots
 
 
 def ending_knots(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses | None
+    carrier: Carrier,
+    amplitudes: ComplexArray,
+    active: IntArray,
+    responses: FingerResponses | None,
 ) -> ComplexArray:
     """Find start and knots (1 + ENDING_KNOTS, active) in strokes, from amplitudes (eras,) to rest.
 
-    found: responses to the active ERAs at quiet fingers that are kept quiet meanwhile.
+    responses: to the active ERAs at quiet fingers that are kept quiet meanwhile.
     """
     knots = np.zeros((1 + ENDING_KNOTS, len(active)), dtype=complex)
     knots[0] = amplitudes[active]
-    weight = 0.0 if found is None else quiet_weight(carrier, amplitudes, active, found)
-    given = ShapedTone(gain_variance=carrier.gain_variance, weight=weight, total=len(amplitudes))
-    played = active.astype(np.int32)
-    given.active, given.residual = played.ctypes.data, carrier.residual_form.ctypes.data
-    if not _found_by_kernel(knots, given, knots[0], found, is_ending=True):
-        knots[1:-1] = ending_by_numpy(carrier, amplitudes, active, found, weight)
+    weight = 0.0
+    if responses is not None:
+        weight = quiet_weight(carrier, amplitudes, active, responses)
+    tone = ShapedTone(gain_variance=carrier.gain_variance, weight=weight, total=len(amplitudes))
+    active_numbers = active.astype(np.int32)
+    tone.active = active_numbers.ctypes.data
+    tone.residual = carrier.residual_form.ctypes.data
+    if not _solved_by_kernel(knots, tone, knots[0], responses, is_ending=True):
+        knots[1:-1] = ending_by_numpy(carrier, amplitudes, active, responses, weight)
     return knots
 
 
 def quiet_weight(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, responses: FingerResponses
 ) -> float:
     """Return the weight of the mean square at quiet fingers in an ending (`ending_by_numpy`)."""
     vibration = np.linalg.norm(amplitudes @ carrier.steady)
-    target = np.linalg.norm(found.steady[: found.targets] @ amplitudes[active])
+    target = np.linalg.norm(responses.steady[: responses.targets] @ amplitudes[active])
     return float(_QUIET_WEIGHT * (vibration / target) ** 2)
 
 
-def _found_by_kernel(
+def _solved_by_kernel(
     knots: ComplexArray,
-    given: ShapedTone,
+    tone: ShapedTone,
     amplitudes: ComplexArray,
-    found: FingerResponses | None,
+    responses: FingerResponses | None,
     *,
     is_ending: bool,
 ) -> bool:
     """Fill in all knots but the first and the last by a kernel; return False without a compiler."""
-    by = kernels()
-    if by is None:
+    compiled = kernels()
+    if compiled is None:
         return False
-    given.eras, given.amplitudes = len(amplitudes), amplitudes.ctypes.data
-    if found is not None:
-        given.targets, given.rows = found.targets, len(found.steady)
-        given.combinations = found.combinations
-        given.hats, given.steady = found.hats.ctypes.data, found.steady.ctypes.data
-    run_kernel(
-        by.library.shaped_knots, c_void_p(knots[1:].ctypes.data), given, _rules(), int(is_ending)
-    )
+    tone.eras = len(amplitudes)
+    tone.amplitudes = amplitudes.ctypes.data
+    if responses is not None:
+        tone.targets = responses.targets
+        tone.rows = len(responses.steady)
+        tone.combinations = responses.combinations
+        tone.hats = responses.hats.ctypes.data
+        tone.steady = responses.steady.ctypes.data
+    solve = compiled.library.shaped_knots
+    run_kernel(solve, c_void_p(knots[1:].ctypes.data), tone, _rules(), int(is_ending))
     return True
 
 

@@ -34,12 +34,12 @@ from model.transients.excursions import (
     excursions_of,
     magnets_of,
     motions_along,
-    reach_of,
     relative_motions,
 )
 from model.transients.knots import (
     steady_states,
 )
+from model.transients.reach import reach_of
 from model.transients.shaping import Shaper, Transients
 from model.transients.time_response import (
     PlateInTime,

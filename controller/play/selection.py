@@ -6,7 +6,7 @@ a time, for the fingers as they are once the previous choice has been made.
 """
 
 import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -454,13 +454,11 @@ class Selector:
 
 def _targets_on_plate(contacts: Sequence[Contact], intent: HapticIntent) -> Targets:
     """Return the targets of an intent with their contacts, in order of arrival."""
-    by_key = defaultdict[ContactKey, list[Target]](list)
-    for target in intent.targets:
-        by_key[target.key].append(target)
     targets = list[FingerTarget]()
     for contact in contacts:
-        for target in by_key.get(contact.key, ()):
-            targets.append(FingerTarget(contact, target))
+        for target in intent.targets:
+            if target.key == contact.key:
+                targets.append(FingerTarget(contact, target))
     return tuple(targets)
 
 

@@ -35,7 +35,8 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope
 from kit.chain import FarEnd
 from kit.clock import in_virtual_time
-from kit.fingers import LAYOUT, LEFT, RIGHT, Fingers
+from kit.fingers import LAYOUT, LEFT, RIGHT, Fingers, fingers_on
+from kit.fingers import table as paper_table
 from kit.plates import smooth_rig, smooth_table
 from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
@@ -435,3 +436,15 @@ def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: s
     } == kept
     first = route(wanted, PAIRED_RIG, ramp=0)
     assert not any(tone.keep_phase for each in first.values() for tone in each.tones)
+
+
+@in_virtual_time
+async def test_ledger_checks_the_set_of_a_touch_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check of the plan still counts when its set is sent."""
+    checks = Mock(side_effect=Ledger.admit)
+    monkeypatch.setattr(Ledger, "admit", lambda *values, **options: checks(*values, **options))
+    async with fingers_on(paper_table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.03)
+        assert len(fingers.committed) == 1
+        assert checks.call_count == 1

@@ -28,6 +28,7 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -188,6 +189,24 @@ def missing_imports(faults: Iterable[PlantedFault]) -> list[str]:
     return reports
 
 
+def undefined_names_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
+    """Describe each undefined name in the code of a fault, as ruff finds it in the changed file."""
+    described = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for fault in faults:
+            for file, text in changed_texts(fault, tree).items():
+                if file.endswith(".py"):
+                    path = folder / f"{len(described)}.py"
+                    path.write_text(text, "utf-8")
+                    described[str(path)] = f"{fault.source}: fault {fault.name}: {file}"
+        command = [sys.executable, "-m", "ruff", "check", "--isolated", "--no-cache"]
+        command += ["--select", "F821", "--output-format", "json", name]
+        completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    findings = json.loads(completed.stdout)
+    return [f"{described[finding['filename']]}: {finding['message']}" for finding in findings]
+
+
 def _concerns(fault: PlantedFault, files: Sequence[str]) -> bool:
     """Return whether a fault is described in, or changes, one of these files (or none given)."""
     own_files = {fault.source, *(edit.file for edit in fault.edits)}
@@ -277,7 +296,7 @@ def main() -> int:
         return 0
     if options.check is not None:
         selected = [fault for fault in faults if _concerns(fault, options.check)]
-        reports = stale_report(selected, ROOT)
+        reports = stale_report(selected, ROOT) or undefined_names_report(selected, ROOT)
         sys.stdout.writelines(f"{report}\n" for report in reports)
         return 1 if reports else 0
     prepare(are_many=len(faults) > _MANY)

@@ -13,6 +13,7 @@ from run import (
     missing_imports,
     missing_tests_report,
     stale_report,
+    undefined_names_report,
 )
 
 HERE = Path(__file__).parent
@@ -124,11 +125,13 @@ def test_other_languages_are_compared_by_tokens_of_a_function() -> None:
 
 
 def test_no_fault_is_stale(request: pytest.FixtureRequest) -> None:
-    """Every pattern matches once; the tests that a fault names and its imports exist."""
+    """Every pattern matches once; names, imports and tests that a fault mentions exist."""
     faults = load_faults()
     assert len(faults) <= MAX_FAULTS
     reports = stale_report(faults, ROOT) + missing_imports(faults)
     assert not reports, "\n".join(reports)
+    undefined = undefined_names_report(faults, ROOT)
+    assert not undefined, "\n".join(undefined)
     folder = request.node.getparent(pytest.Dir)
     single_checks = pytest.Module.from_parent(folder, path=HERE / "one_conformance.py")
     existing = request.config.stash[COLLECTED] | {test.nodeid for test in single_checks.collect()}

@@ -14,8 +14,8 @@ from era_haptics.drive import Played, expect_rig, playable_layers
 from model.errors import InputError, expect_path, shown
 from model.estimate.calibrate import calibrate as fit
 from model.estimate.calibration_result import Calibration
-from model.estimate.measurement import measurement_of, read_measured
 from model.processes import Progress, check_progress, unseen
+from model.response_files import measurement_of, read_measured
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.plate_sections import PlateSection
 from model.rig.rig import Rig

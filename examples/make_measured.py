@@ -17,13 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.measurement import (
-    Measurement,
-    sensors_at,
-    write_responses_csv,
-    write_responses_uff,
-)
+from model.estimate.measurement import Measurement, sensors_at
 from model.reduction.reduced_plate import reduce_plate
+from model.response_files import write_responses_csv, write_responses_uff
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of

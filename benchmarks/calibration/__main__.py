@@ -23,7 +23,8 @@ from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.measurement import Measurement, measurement_of, read_measured
+from model.estimate.measurement import Measurement
+from model.response_files import measurement_of, read_measured
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 

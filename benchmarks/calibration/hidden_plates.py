@@ -24,9 +24,10 @@ from kit.direct_plate import direct_acceleration
 from model.arrays import ComplexArray, FloatArray
 from model.estimate.gains import gains_of as best_gains
 from model.estimate.gains import row_rms
-from model.estimate.measurement import Measurement, sensors_at, write_responses_csv
+from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.sensed_plate import sensed_plate
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
+from model.response_files import write_responses_csv
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.attachments import PointLoad

@@ -143,7 +143,8 @@ def calibrate(
         gain_rows,
     )
     from model.estimate.calibration_result import calibration_errors
-    from model.estimate.measurement import LEAST_SENSORS, measurement_of, read_measured
+    from model.estimate.measurement import LEAST_SENSORS
+    from model.response_files import measurement_of, read_measured
     from model.rig.rig_file import load_rig
 
     check_rig_output(output, rig_file, measured_file)

@@ -435,8 +435,8 @@ def template(
     It marks the position of every part glued to the board. Print it at 100 %: the printed ruler
     must measure 100 mm.
     """
-    from model.estimate.measurement import read_places
     from model.figures.template import Template, write_template
+    from model.response_files import read_places
     from model.rig.rig_file import load_rig
 
     check_picture(output)

@@ -116,9 +116,7 @@ def check_rows(calibration: Calibration) -> list[str]:
 
 def calibration_json(calibration: Calibration, original: Rig) -> dict[str, Any]:
     """Return all results as JSON, with units in the keys or next to the values."""
-    gains = {}
-    for era, errors in zip(calibration.rig.eras, calibration.gains_error.T, strict=True):
-        gains[era.name] = _gains_json(era, errors)
+    gain_errors = zip(calibration.rig.eras, calibration.gains_error.T, strict=True)
     moved = []
     for name, (position, error) in calibration.moved.items():
         era = original.era(name)
@@ -130,18 +128,18 @@ def calibration_json(calibration: Calibration, original: Rig) -> dict[str, Any]:
                 "standard_error_m": list(error),
             }
         )
-    scales = {}
-    for name, (scale, scale_error) in calibration.scales.items():
-        scales[name] = {"scale": scale, "standard_error": scale_error}
+    scales = calibration.scales.items()
     return {
         "parameters": list(map(_parameter_json, calibration.parameters)),
-        "gains": gains,
+        "gains": {era.name: _gains_json(era, errors) for era, errors in gain_errors},
         "moved_eras": moved,
         "uncertainty": asdict(calibration.rig.uncertainty),
         "not_identified": _unidentified(calibration),
         "dead_sensors": list(calibration.dead_sensors),
         "dead_eras": list(calibration.dead_eras),
-        "sensor_scales": scales,
+        "sensor_scales": {
+            name: {"scale": scale, "standard_error": error} for name, (scale, error) in scales
+        },
         "sensors": list(calibration.measurement.names),
         "drive_frequencies_hz": calibration.measurement.frequencies.tolist(),
         "values": calibration.value_count,

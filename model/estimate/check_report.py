@@ -72,9 +72,7 @@ def channel_table(verdict: Verdict) -> list[str]:
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """Return the verdict as JSON; units are in the keys."""
-    swapped = []
-    for cycle in cycles(verdict.channels):
-        swapped.append([channel.era for channel in cycle])
+    swapped = [[channel.era for channel in cycle] for cycle in cycles(verdict.channels)]
     return {
         "all_well": verdict.is_well,
         "channels": list(map(_channel_json, verdict.channels)),

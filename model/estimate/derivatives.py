@@ -207,7 +207,7 @@ class ResponseDerivatives:
         """Return L dA L^T (f, s, c) for a change dA of the free receptance (f, a, a)."""
         left = self.plate.left
         observed = left[:, self.plate.model.observed]
-        return np.asarray(observed @ free_change @ left[:, self._driven].swapaxes(1, 2))
+        return observed @ free_change @ left[:, self._driven].swapaxes(1, 2)
 
     def _rank_one(self, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
         """Return changes of the responses for dT = factor u v^T (f, s, n, m).

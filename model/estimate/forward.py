@@ -179,10 +179,11 @@ class ForwardModel:
     @cached_property
     def pads(self) -> FloatArray:
         """Footprints (q, 3) of the sensors that are not at ERAs [m]."""
-        pads = []
-        for sensor in self.sensors:
-            if not sensor.era:
-                pads.append((sensor.x, sensor.y, SENSOR_FOOT * bool(sensor.mass)))
+        pads = [
+            (sensor.x, sensor.y, SENSOR_FOOT if sensor.mass else 0.0)
+            for sensor in self.sensors
+            if not sensor.era
+        ]
         return np.array(pads, dtype=float).reshape(-1, 3)
 
     @cached_property
@@ -200,14 +201,12 @@ class ForwardModel:
         """Return the shapes of the modes at all attachments.
 
         A plate with form errors is extrapolated from the rig's positions by the slopes of its
-        shapes, since positions can leave the plate. Other plates are solved at the positions,
-        clipped to the plate.
+        shapes, since positions can leave the plate. Other plates are solved at the positions.
         """
         footprints = self._footprints(values)
         nominal = self._nominal_attachments
         if self.form is not None:
             return nominal.moved(footprints, self.movable)
-        footprints[:, :2] = np.clip(footprints[:, :2], 0, self.sides)
         if np.array_equal(footprints, nominal.footprints):
             return nominal
         return places_of(self.modes, footprints, self.movable, self.sides)
@@ -216,18 +215,18 @@ class ForwardModel:
     def _nominal_attachments(self) -> AttachmentPoints:
         """Shapes of the modes at all attachments at the rig's positions."""
         nominal = PlateValues(self.rig, self.space, np.zeros(self.space.size))
-        footprints = self._footprints(nominal)
-        if self.form is None:
-            footprints[:, :2] = np.clip(footprints[:, :2], 0, self.sides)
-        return places_of(self.modes, footprints, self.movable, self.sides)
+        return places_of(self.modes, self._footprints(nominal), self.movable, self.sides)
 
     def _footprints(self, values: PlateValues) -> FloatArray:
-        """Return the footprints of ERAs, masses, additional masses and sensors, (a, 3) [m]."""
+        """Return the footprints of ERAs, masses, additional masses and sensors, (a, 3) [m].
+
+        Clipped to the plate, unless form errors continue the shapes beyond it.
+        """
         feet = [era.foot for era in self.rig.eras]
         points = values["masses"][:, 1:]
         pads = self.pads.copy()
         pads[: len(values["sensor_place"]), :2] += values["sensor_place"]
-        return np.vstack(
+        footprints = np.vstack(
             [
                 np.column_stack([values["place"], feet]),
                 footprints_of(self.rig.masses),
@@ -235,6 +234,9 @@ class ForwardModel:
                 pads,
             ]
         )
+        if self.form is None:
+            footprints[:, :2] = np.clip(footprints[:, :2], 0, self.sides)
+        return footprints
 
 
 class FormMatrices(NamedTuple):
@@ -443,7 +445,7 @@ class PlateAt:
         if inertia is None:
             return None
         observed = self.model.observed
-        return np.asarray(1 / (1 - inertia * self.receptance[:, observed, observed]))
+        return 1 / (1 - inertia * self.receptance[:, observed, observed])
 
     @cached_property
     def loaded_receptance(self) -> ComplexArray:

@@ -1,8 +1,15 @@
 """Gains of drives: the complex gains for which a model's responses fit measured values best.
 
-Gains that a fit leaves free follow from the model's responses by linear least squares. Their
-derivatives let a fit search only the parameters of the model (variable projection: Golub and
-Pereyra, SIAM J. Numer. Anal. 10, 1973).
+The gain g of a drive at a frequency multiplies the model's responses a_s at all sensors. With
+measured values d_s of weight w_s, and a standard deviation sigma of |g| from 1, it minimizes
+
+    sum_s w_s² |d_s - g a_s|² + (|g| - 1)² / sigma²,
+
+g = |g| p,    p = b / |b|,    |g| = (|b| + 1 / sigma²) / c,
+b = sum_s w_s² a_s* d_s,      c = sum_s w_s² |a_s|² + 1 / sigma².
+
+The derivatives of g let a fit search only the parameters of the model (variable projection: Golub
+and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 """
 
 import math
@@ -59,19 +66,20 @@ def _free_gains(
     squared_weight = weight**2
     weighted = squared_weight * responses.conj()
     precision = measurement.gain_std**-2
-    power = ((weight * np.abs(responses)) ** 2).sum(axis=1) + precision
+    power = ((weight * np.abs(responses)) ** 2).sum(axis=1) + precision  # c
     power = np.where(power > 0, power, 1.0)
-    inner = (weighted * values).sum(axis=1)
-    is_zero = inner == 0
-    length = np.where(is_zero, 1.0, np.abs(inner))
-    phasor = np.where(is_zero, 1.0, inner / length)
-    size = (np.abs(inner) + precision) / power
-    inner_slopes = np.einsum("fsnq,fsn->fnq", slopes.conj(), squared_weight * values)
-    inner_slopes = inner_slopes * phasor.conj()[..., None]
+    product = (weighted * values).sum(axis=1)  # b
+    is_zero = product == 0
+    length = np.where(is_zero, 1.0, np.abs(product))
+    phasor = np.where(is_zero, 1.0, product / length)  # p
+    size = (np.abs(product) + precision) / power  # |g|
+
+    # Derivatives of b / p, whose real part is d|b| and whose imaginary part is |b| d(arg p).
+    product_slopes = np.einsum("fsnq,fsn->fnq", slopes.conj(), squared_weight * values)
+    product_slopes = product_slopes * phasor.conj()[..., None]
     power_slopes = 2 * np.einsum("fsnq,fsn->fnq", slopes, weighted).real
-    size_slopes = inner_slopes.real - size[..., None] * power_slopes
-    size_slopes = size_slopes / power[..., None]
-    phase_slopes = (size / length)[..., None] * inner_slopes.imag
+    size_slopes = (product_slopes.real - size[..., None] * power_slopes) / power[..., None]
+    phase_slopes = (size / length)[..., None] * product_slopes.imag  # |g| d(arg p)
     return size * phasor, phasor[..., None] * (size_slopes + 1j * phase_slopes)
 
 

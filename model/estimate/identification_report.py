@@ -13,7 +13,7 @@ from typing import Any
 from model.estimate.fit_report import TableRow, confusions, quality_rows, table_lines
 from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification
 from model.estimate.parameter_space import ParameterKind
-from model.estimate.parameters import PARAMETER_KINDS
+from model.estimate.parameters import PARAMETER_KINDS, SensorParameter
 from model.estimate.sensed_plate import MAX_GUESSED, Parameter
 from model.quantities import estimate_text, percent
 from model.study.expected_contrast import ExpectedContrast
@@ -44,9 +44,9 @@ def _identified(
     number: index in the space; number_in_kind: among the parameters of its kind.
     """
     space = identification.fitted.space
-    kind: ParameterKind = PARAMETER_KINDS[kind_name]
+    kind = PARAMETER_KINDS[kind_name]
     if kind_name == "masses" and number_in_kind % 3 > 0:
-        kind = PARAMETER_KINDS["place"]  # x or y of the mass
+        kind = PARAMETER_KINDS["sensor_place"]  # x or y of the mass
     prior = float(space.std[number])
     error = float(identification.std[number])
     difference = prior * float(identification.fitted.x[number])
@@ -58,10 +58,20 @@ def _identified(
         kind=kind_name,
         name=space.names[number],
         unit=kind.unit,
+        era=_era_of(identification, kind, number_in_kind),
         value=kind.per_unit * difference,
         standard_error=kind.per_unit * error,
         prior=kind.per_unit * prior,
     )
+
+
+def _era_of(identification: Identification, kind: ParameterKind, number_in_kind: int) -> str:
+    """Return the ERA of a parameter, or the ERA at which its sensor is, "" without one."""
+    if isinstance(kind, SensorParameter):
+        return identification.fitted.measurement.sensors[number_in_kind].era
+    if kind.per_era:
+        return identification.rig.eras[number_in_kind // kind.per_era].name
+    return ""
 
 
 def parameter_rows(identification: Identification) -> list[str]:
@@ -78,7 +88,7 @@ def parameter_rows(identification: Identification) -> list[str]:
         if is_clear or PARAMETER_KINDS[parameter.kind].is_listed:
             listed.append((parameter, parameter.standard_error))
     order = {era.name: number for number, era in enumerate(identification.rig.eras)}
-    listed.sort(key=lambda row: order.get(row[0].name.rpartition(" ")[2], -1))
+    listed.sort(key=lambda row: order.get(row[0].era, -1))
     return table_lines(
         [_difference_row(parameter, error, confused[parameter.name]) for parameter, error in listed]
     )
@@ -147,27 +157,25 @@ def identification_json(
     identification: Identification, contrasts: Sequence[ExpectedContrast]
 ) -> dict[str, Any]:
     """Return all results as JSON, with units in the keys or next to the values."""
-    parameters = []
-    for parameter in identified_parameters(identification):
-        parameters.append(
-            {
-                "name": parameter.name,
-                "unit": _UNIT_KEYS.get(parameter.unit, parameter.unit),
-                "difference": parameter.value,
-                "standard_error": parameter.standard_error,
-                "standard_deviation_before": parameter.prior,
-            }
-        )
-    expected = []
-    for contrast in contrasts:
-        expected.append(
-            {
-                "quiet": contrast.quiet,
-                "before_db": contrast.before,
-                "after_db": contrast.after,
-                "promised_db": contrast.promised,
-            }
-        )
+    parameters = [
+        {
+            "name": parameter.name,
+            "unit": _UNIT_KEYS.get(parameter.unit, parameter.unit),
+            "difference": parameter.value,
+            "standard_error": parameter.standard_error,
+            "standard_deviation_before": parameter.prior,
+        }
+        for parameter in identified_parameters(identification)
+    ]
+    expected = [
+        {
+            "quiet": contrast.quiet,
+            "before_db": contrast.before,
+            "after_db": contrast.after,
+            "promised_db": contrast.promised,
+        }
+        for contrast in contrasts
+    ]
     held_out = identification.held_out
     return {
         "explained": identification.is_explained,

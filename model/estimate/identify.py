@@ -146,19 +146,12 @@ class Identification:
     @cached_property
     def std(self) -> FloatArray:
         """Standard error of each parameter in its unit (p,)."""
-        return self.fitted.space.std * np.sqrt(np.diagonal(self.covariance))
+        return _parameter_stds(self.fitted.space, self.covariance)
 
     def stds(self) -> dict[str, FloatArray]:
         """Standard errors of the quantities that answers depend on, with model errors, by
         kind."""
-        space = self.fitted.space
-        stds = {}
-        for kind, combinations in relevant(space).items():
-            stds[kind] = std_of(combinations, space, self.covariance)
-        stds["place"] = self.std[space.groups["place"]]
-        for kind, std in stds.items():
-            stds[kind] = np.where(std > 0, np.hypot(std, _THEORY.get(kind, 0.0)), 0.0)
-        return stds
+        return _relevant_stds(self.fitted.space, self.covariance)
 
     def within(self, space: Space) -> tuple[FloatArray, FloatArray]:
         """Return parameters (p,) and covariance (p, p) in a larger space; additional ones are 0 and
@@ -173,18 +166,18 @@ class Identification:
     def uncertainty(self, unexplained: float) -> Uncertainty:
         """Return the `uncertainty` of the identified rig.
 
-        unexplained: fraction of the fields that the model does not explain. Fingers and harmonics
-        keep their uncertainty. common_gain, which no fit narrows, is added to the error of the mean
-        gain. The disagreement of held-out paths is left out: `unexplained` states the same error.
+        unexplained: fraction of the fields that the model does not explain. The disagreement of
+        held-out paths is left out, because `unexplained` states the same error. Fingers and
+        harmonics keep their uncertainty. common_gain, which no fit narrows, is added to the error
+        of the mean gain.
         """
-        if self.held_out is not None:
-            fit_alone = replace(self, covariance=self.fitted.stated_covariance, held_out=None)
-            return fit_alone.uncertainty(unexplained)
         space = self.fitted.space
+        covariance = self.fitted.stated_covariance
         original = self.fitted.model.rig.uncertainty
         mean_gain = _rows(space, "gain").mean(axis=0, keepdims=True)
-        mean_gain_std = std_of(mean_gain, space, self.covariance)[0]
-        errors = {kind: rms(std) for kind, std in self.stds().items()}
+        mean_gain_std = std_of(mean_gain, space, covariance)[0]
+        stds = _relevant_stds(space, covariance)
+        errors = {kind: rms(std) for kind, std in stds.items()}
         return Uncertainty.clipped(
             gain=math.hypot(errors["gain"], _DRIVE_GAIN),
             phase_deg=math.hypot(math.degrees(errors["phase"]), _DRIVE_PHASE_DEG),
@@ -196,10 +189,25 @@ class Identification:
             field=unexplained,
             place=errors["place"],
             harmonic=original.harmonic,
-            supports=rms(self.std[space.groups["supports"]]),
+            supports=rms(_parameter_stds(space, covariance)[space.groups["supports"]]),
             weather=original.weather,
             foreign_mass=original.foreign_mass,
         )
+
+
+def _parameter_stds(space: Space, covariance: FloatArray) -> FloatArray:
+    """Return the standard error of each parameter in its unit (p,)."""
+    return space.std * np.sqrt(np.diagonal(covariance))
+
+
+def _relevant_stds(space: Space, covariance: FloatArray) -> dict[str, FloatArray]:
+    """Return standard errors of the quantities that answers depend on, with model errors, by
+    kind."""
+    stds = {kind: std_of(rows, space, covariance) for kind, rows in relevant(space).items()}
+    stds["place"] = _parameter_stds(space, covariance)[space.groups["place"]]
+    for kind, std in stds.items():
+        stds[kind] = np.where(std > 0, np.hypot(std, _THEORY.get(kind, 0.0)), 0.0)
+    return stds
 
 
 def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen) -> Identification:
@@ -232,7 +240,7 @@ def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen)
     uncertainty = board.uncertainty
     if identification.is_explained:
         uncertainty = identification.uncertainty(held_out.unexplained if held_out else 0.0)
-    covariance = identification.covariance
+    covariance = fitted.stated_covariance
     if held_out:
         covariance = covariance + held_out.disagreement
     progress(1 + HELD_OUT_FOLDS, 1 + HELD_OUT_FOLDS)
@@ -360,7 +368,7 @@ def hold_out(result: RigFit, *, progress: Progress = unseen) -> HeldOutPaths | N
     squares = np.full(measurement.values.shape, np.nan)
     variance = squares.copy()
     noise = min(result.chi2, 1.0)  # readings can be better than stated
-    fits = []
+    fitted_x = []
     for fold in range(HELD_OUT_FOLDS):
         progress(1 + fold, 1 + HELD_OUT_FOLDS)
         hidden = measurement.known & (folds == fold)
@@ -378,18 +386,26 @@ def hold_out(result: RigFit, *, progress: Progress = unseen) -> HeldOutPaths | N
         variance[hidden] = _prediction_variance(partial, hidden)
         errors = np.abs(partial.fitted_plate.responses - measurement.values)[hidden]
         squares[hidden] = errors**2 - 2 * noise * measurement.std[hidden] ** 2
-        fits.append(partial.x)
+        fitted_x.append(partial.x)
     mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
-    predicted = variance < _MAX_PREDICTION_STD**2 * mean_square
-    if predicted.sum() < _MIN_PREDICTED:
+    is_determined = variance < _MAX_PREDICTION_STD**2 * mean_square
+    if is_determined.sum() < _MIN_PREDICTED:
         return None
-    mean_square = mean_square[predicted]
-    total = _positive_root(squares[predicted] / mean_square)
-    unexplained = _positive_root((squares - variance)[predicted] / mean_square)
+    mean_square = mean_square[is_determined]
+    total = _positive_root(squares[is_determined] / mean_square)
+    unexplained = _positive_root((squares - variance)[is_determined] / mean_square)
     share = (unexplained / total) ** 2 if unexplained else 0.0
-    difference = np.array(fits) - np.mean(fits, axis=0)
-    jackknife = (1 - 1 / len(fits)) * difference.T @ difference
-    return HeldOutPaths(total, unexplained, share * _IN_COMMON**2 * jackknife)
+    disagreement = share * _IN_COMMON**2 * _jackknife_covariance(np.array(fitted_x))
+    return HeldOutPaths(total, unexplained, disagreement)
+
+
+def _jackknife_covariance(estimates: FloatArray) -> FloatArray:
+    """Return the covariance (p, p) of an estimate, from estimates (g, p) without one of g groups.
+
+    (g - 1) / g times the sum over groups of the outer product of differences from the mean.
+    """
+    difference = estimates - np.mean(estimates, axis=0)
+    return np.asarray((1 - 1 / len(estimates)) * difference.T @ difference)
 
 
 def _prediction_variance(partial: RigFit, hidden: NDArray[np.bool_]) -> FloatArray:
@@ -411,17 +427,14 @@ def unknowns(identification: Identification) -> list[str]:
     States their standard errors before and after the measurement.
     """
     space = identification.fitted.space
-    model = identification.fitted.model
     prior = np.diag(space.uncertain.astype(float))
     rows = []
     for kind, combinations in relevant(space).items():
-        before_std = std_of(combinations, space, prior)
+        prior_std = std_of(combinations, space, prior)
         std = std_of(combinations, space, identification.covariance)
         built_std = std_of(combinations, space.as_built, prior)
-        unknown = np.flatnonzero((before_std > 0) & (std > _UNKNOWN * built_std))
-        if kind == "stiffness" and model.frequencies[0] > _SUSPENSION_FELT:
-            excites = np.array(["force_factor" in era.fields for era in model.rig.eras])
-            unknown = unknown[~excites[unknown]]
+        is_unknown = (prior_std > 0) & (std > _UNKNOWN * built_std)
+        unknown = np.flatnonzero(is_unknown & _are_needed(identification.fitted.model, kind))
         # Losses and frequencies of single modes count only if no tone has shown them.
         is_of_modes = kind in ("frequency", "loss")
         if not len(unknown) or (is_of_modes and len(unknown) < len(combinations)):
@@ -432,10 +445,20 @@ def unknowns(identification: Identification) -> list[str]:
             name = space.names[best_of(np.abs(combinations[worst]))]
         rows.append(
             f"{name}: known to {_error_text(kind, std[worst])}, "
-            f"before {_error_text(kind, before_std[worst])}; "
+            f"before {_error_text(kind, prior_std[worst])}; "
             f"{_advice(identification, combinations[worst])}"
         )
     return rows
+
+
+def _are_needed(model: ForwardModel, kind: str) -> NDArray[np.bool_]:
+    """Return whether tones depend on the quantities of a kind, (m,) or () for all.
+
+    Tones far above the resonance of an exciter do not depend on the stiffness of its suspension.
+    """
+    if kind != "stiffness" or model.frequencies[0] <= _SUSPENSION_FELT:
+        return np.array(True)
+    return np.array(["force_factor" not in era.fields for era in model.rig.eras])
 
 
 def _error_text(kind: str, std: float) -> str:
@@ -500,15 +523,12 @@ def _narrowing(plate: PlateAt, covariance: FloatArray, direction: FloatArray) ->
 def identification_errors(identification: Identification) -> dict[KeyPath, float]:
     """Return standard errors of the values in a rig file, by key path."""
     rig = identification.rig
-    std = {}
-    for kind, part in identification.fitted.space.groups.items():
-        std[kind] = identification.std[part]
+    groups = identification.fitted.space.groups
+    std = {kind: identification.std[part] for kind, part in groups.items()}
     of_eras = np.transpose([std["stiffness"], std["damping_each"]]).ravel()
     relative = np.concatenate([std["thickness"], std["loss"], of_eras, std["supports"]])
     parameters = parameters_of(
         rig, ("thickness", "loss_factor"), ("stiffness", "damping"), rig.foot_names
     )
-    errors = []
-    for parameter, error in zip(parameters, relative, strict=True):
-        errors.append((parameter, parameter.before * error))
-    return errors_by_key(rig, errors)
+    values = np.array([parameter.before for parameter in parameters])
+    return errors_by_key(rig, zip(parameters, values * relative, strict=True))

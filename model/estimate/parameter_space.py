@@ -103,6 +103,8 @@ class ParameterKind(ABC):
     theory = 0.0
     """Error of a fitted value from plate theory: its change with viscous losses and without shear
     deformation, for plates of 1.5 mm."""
+    per_era = 0
+    """Number of parameters of each ERA, 0 if they do not belong to ERAs."""
     stage = 2
     """Stage of an identification that searches it: 0 first, 1 with the positions of masses, 2
     last."""

@@ -78,6 +78,8 @@ class PlateParameter(DifferentiableKind):
 class EraParameter(DifferentiableKind):
     """Kind with one parameter per ERA."""
 
+    per_era = 1
+
     def names(self, scope: SearchScope) -> Sequence[str]:
         return [f"{self.label} {era}" for era in scope.eras]
 
@@ -498,6 +500,7 @@ class EraLocation(DifferentiableKind):
     unit = "mm"
     per_unit = 1e3
     theory = 1e-4
+    per_era = 2
     stage = 1
 
     def names(self, scope: SearchScope) -> Sequence[str]:

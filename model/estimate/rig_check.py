@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,33 +93,41 @@ _EXPLAINS = 0.6  # of the median residual without glue
 _MIN_CHANNELS = 3  # whose median shows a common error of the amplifier
 
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
-_QUANTITIES = (
-    ("g", f"multiply by {GRAVITY}", 1 / GRAVITY, 0),
-    ("mm/s² per m", "divide by 1000", 1e3, 0),
-    ("m/s² per mm", "multiply by 1000", 1e-3, 0),
-    ("m/s² per µm", "multiply by 1000000", 1e-6, 0),
-    ("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY, 0),
-    ("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY, 0),
-    ("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
-    ("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
-    ("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
-    ("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
-    ("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
-)
-"""Quantities that responses may be by mistake: name, remedy, factor and power.
 
-They are factor * (i omega)^power times acceleration per displacement.
-"""
+
+class _Quantity(NamedTuple):
+    """Quantity that responses can be by mistake: factor * (i omega)^power times the right one."""
+
+    name: str
+    remedy: str
+    factor: float
+    power: int = 0
+
+
+_RIGHT_QUANTITY = _Quantity("acceleration per displacement", "", 1.0)
+_WRONG_QUANTITIES = (
+    _Quantity("g", f"multiply by {GRAVITY}", 1 / GRAVITY),
+    _Quantity("mm/s² per m", "divide by 1000", 1e3),
+    _Quantity("m/s² per mm", "multiply by 1000", 1e-3),
+    _Quantity("m/s² per µm", "multiply by 1000000", 1e-6),
+    _Quantity("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY),
+    _Quantity("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY),
+    _Quantity("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
+    _Quantity("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
+    _Quantity("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
+    _Quantity("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
+    _Quantity("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
+)
 
 
 @dataclass(frozen=True)
 class _Options:
-    """Options of `diagnose`."""
+    """Options of `diagnose`, and the findings about sensors that were left out so far."""
 
     false_alarm: float
     has_form: bool
     refuses: bool
-    skipped: tuple[Finding, ...]
+    skipped: tuple[Finding, ...] = ()
 
 
 def diagnose(
@@ -128,7 +137,6 @@ def diagnose(
     false_alarm: float = FALSE_ALARM,
     has_form: bool = False,
     refuses: bool = False,
-    skipped: tuple[Finding, ...] = (),
 ) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
@@ -136,15 +144,19 @@ def diagnose(
     - has_form: whether to include form errors, and search for differences beyond their tolerances
       (needs sensors of known scale).
     - refuses: whether responses that contradict their metadata are an error.
-    - skipped: findings about sensors that were left out before.
 
     Raises InputError for fewer than three usable sensors or four frequencies.
     """
+    return _diagnosed(rig, observation, _Options(false_alarm, has_form, refuses))
+
+
+def _diagnosed(rig: Rig, observation: Measurement, options: _Options) -> Verdict:
+    """Compare a measurement with the rig's prediction; see `diagnose`."""
     plate, observation, dead, silent = _without_silent_sensors(rig, observation)
-    options = _Options(false_alarm, has_form, refuses, skipped + silent)
+    options = replace(options, skipped=options.skipped + silent)
     live = replace(observation, values=np.where(dead, np.nan, observation.values))
     shapes = match_shapes(plate, live.values)
-    reverse = reversed_axes(plate, shapes, live, may_be_plugs=refuses)
+    reverse = reversed_axes(plate, shapes, live, may_be_plugs=options.refuses)
     if reverse:
         return _corrected(reverse, options)
     misread = other_meaning(plate, shapes, live)
@@ -152,7 +164,7 @@ def diagnose(
         return _corrected_board(misread, observation, options)
     if dead.any():
         shapes = match_shapes(plate, observation.values)
-    if refuses:
+    if options.refuses:
         _check_quantity(plate, shapes, observation.values)
         _check_phases(plate, shapes, observation.values)
     dead |= _dead_channels(plate, observation.values, shapes)
@@ -168,13 +180,8 @@ def diagnose(
     off_scale = _off_scale_sensors(match)
     if off_scale and len(observation.names) - len(off_scale) >= LEAST_SENSORS:
         is_off = np.isin(observation.names, [finding.of for finding in off_scale])
-        return diagnose(
-            rig,
-            observation.without(is_off),
-            false_alarm=false_alarm,
-            has_form=has_form,
-            skipped=(*options.skipped, *off_scale),
-        )
+        options = replace(options, refuses=False, skipped=(*options.skipped, *off_scale))
+        return _diagnosed(rig, observation.without(is_off), options)
     return _matched_verdict(match, observation, dead, options)
 
 
@@ -211,13 +218,7 @@ def _corrected(correction: Correction, options: _Options) -> Verdict:
     finding, rig, observation = correction
     if options.refuses:
         raise InputError(finding.rule)
-    verdict = diagnose(
-        rig,
-        observation,
-        false_alarm=options.false_alarm,
-        has_form=options.has_form,
-        skipped=options.skipped,
-    )
+    verdict = _diagnosed(rig, observation, options)
     return replace(verdict, findings=(finding, *verdict.findings))
 
 
@@ -239,11 +240,12 @@ def _verdict_without_response(
     rig: Rig, observation: Measurement, dead: NDArray[np.bool_], options: _Options
 ) -> Verdict:
     """Return the verdict if no channel moves the plate."""
-    channels = []
-    for number, is_dead in enumerate(dead.tolist()):
-        channels.append(_without_response(rig, number, is_dead=is_dead))
+    channels = tuple(
+        _without_response(rig, number, is_dead=is_dead)
+        for number, is_dead in enumerate(dead.tolist())
+    )
     return with_findings(
-        Verdict(tuple(channels), observation.names, observation.frequencies, options.skipped)
+        Verdict(channels, observation.names, observation.frequencies, options.skipped)
     )
 
 
@@ -353,42 +355,55 @@ def _channels(
     whether phases are relative to the drives.
     """
     shapes = match_responses(match.responses, match.values)
-    predicted = np.where(match.outliers, np.nan, match.predicted)
-    for number, driven in enumerate(match.drives):
-        values = match.values[..., number]
-        if dead[number] or not np.isfinite(values).any():
-            yield _without_response(rig, number, is_dead=bool(dead[number]))
-            continue
-        phase, coherence = None, 0.0
-        if has_phases:
-            phase, coherence = mean_phase(values, predicted[..., number])
-        gain = _relative_gain(match, rig, number)
-        states = _phase_states(phase)
-        if not 1 / _strong_gain(rig, number) <= gain <= _strong_gain(rig, number):
-            states.insert(0, "weak" if gain < 1 else "strong")
-        if driven != number:
-            states.insert(0, "other ERA")
-        if number in loose:
-            states = ["loose", *(state for state in states if state != "weak")]
-        rivals = [rival for rival in range(len(dead)) if rival != driven]
-        confidence = min(shapes.confidence(number, driven, rival) for rival in rivals)
-        if "inverted" in states:
-            confidence = min(confidence, coherence)
-        era = rig.eras[number]
-        wired = rig.wiring[era.name]
-        mac = shapes.medians[number]
-        yield ChannelVerdict(
-            era=era.name,
-            amplifier=wired.amplifier,
-            channel=wired.number,
-            states=tuple(states) or ("well",),
-            drives=rig.eras[driven].name,
-            gain=gain,
-            phase=phase,
-            mac_own=float(mac[number]),
-            mac_found=float(mac[driven]),
-            confidence=confidence,
-        )
+    for number, is_dead in enumerate(dead.tolist()):
+        if is_dead or not np.isfinite(match.values[..., number]).any():
+            yield _without_response(rig, number, is_dead=is_dead)
+        else:
+            is_loose = number in loose
+            yield _channel(match, rig, shapes, number, is_loose=is_loose, has_phases=has_phases)
+
+
+def _channel(
+    match: Match, rig: Rig, shapes: ShapeMatch, number: int, *, is_loose: bool, has_phases: bool
+) -> ChannelVerdict:
+    """Judge a channel with a response, by index; see `_channels`."""
+    driven = match.drives[number]
+    phase, coherence = None, 0.0
+    if has_phases:
+        is_outlier = match.outliers[..., number]
+        predicted = np.where(is_outlier, np.nan, match.predicted[..., number])
+        phase, coherence = mean_phase(match.values[..., number], predicted)
+    gain = _relative_gain(match, rig, number)
+    strong_gain = _strong_gain(rig, number)
+    states = []
+    if is_loose:
+        states.append("loose")
+    if driven != number:
+        states.append("other ERA")
+    if gain > strong_gain:
+        states.append("strong")
+    elif gain < 1 / strong_gain and not is_loose:
+        states.append("weak")
+    states += _phase_states(phase)
+    rivals = [rival for rival in range(len(rig.eras)) if rival != driven]
+    confidence = min(shapes.confidence(number, driven, rival) for rival in rivals)
+    if "inverted" in states:
+        confidence = min(confidence, coherence)
+    era = rig.eras[number]
+    wired = rig.wiring[era.name]
+    mac = shapes.medians[number]
+    return ChannelVerdict(
+        era=era.name,
+        amplifier=wired.amplifier,
+        channel=wired.number,
+        states=tuple(states) or ("well",),
+        drives=rig.eras[driven].name,
+        gain=gain,
+        phase=phase,
+        mac_own=float(mac[number]),
+        mac_found=float(mac[driven]),
+        confidence=confidence,
+    )
 
 
 def _relative_gain(match: Match, rig: Rig, number: int) -> float:
@@ -555,32 +570,31 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray
     """Raise InputError if the gains of all channels indicate another quantity or unit."""
     model = plate.responses(plate.start(*shapes.start))[..., shapes.nearest]
     gains = gains_of(model, values)
-    size = np.log(row_rms(values) / row_rms(model))[:, 0]
+    sizes = np.log(row_rms(values) / row_rms(model))[:, 0]
     is_driven = np.isfinite(gains)
     omega = plate.omega[:, None]
 
-    def distance(factor: float, power: int) -> float:
-        """Return the distance of gains from a quantity's gains, in size and phase."""
-        expected = factor * (1j * omega) ** power
-        size_error = np.abs(size - np.log(np.abs(expected)))[is_driven]
+    def distance(quantity: _Quantity) -> float:
+        """Return the distance of gains from the gains of a quantity, in size and phase."""
+        expected = quantity.factor * (1j * omega) ** quantity.power
+        size_error = np.abs(sizes - np.log(np.abs(expected)))[is_driven]
         phase_error = np.angle(gains / expected)[is_driven]
         return float(np.median(size_error) + 1 - np.median(np.cos(phase_error)))
 
-    level = float(np.median(size[is_driven]))
-    name, remedy, factor, power = best_by(
-        _QUANTITIES, lambda quantity: -distance(quantity[2], quantity[3])
-    )
-    gap = distance(factor, power)
-    if abs(level) < np.log(_MAX_GAIN) or distance(1.0, 0) < gap:
+    level = float(np.median(sizes[is_driven]))
+    nearest = best_by(_WRONG_QUANTITIES, lambda quantity: -distance(quantity))
+    gap = distance(nearest)
+    if abs(level) < np.log(_MAX_GAIN) or distance(_RIGHT_QUANTITY) < gap:
         return
+    ratio = f"{np.exp(level):.3g} times the prediction"
     if gap < np.log(_MAX_GAIN):
         raise InputError(
             "responses must be acceleration per base displacement in 1/s²; values appear to be in "
-            f"{name}: all are {np.exp(level):.3g} times the prediction; {remedy}"
+            f"{nearest.name}: all are {ratio}; {nearest.remedy}"
         )
     raise InputError(
-        f"responses must match the rig within a factor of {_MAX_GAIN:g}, got "
-        f"{np.exp(level):.3g} times the prediction; check their unit and the stroke of the ERAs"
+        f"responses must match the rig within a factor of {_MAX_GAIN:g}, got {ratio}; check their "
+        "unit and the stroke of the ERAs"
     )
 
 

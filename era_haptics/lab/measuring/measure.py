@@ -29,8 +29,9 @@ from era_haptics.lab.measuring.sensor_file import WiredSensor, read_sensors
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
-from model.estimate.measurement import MeasuredPlate, Measurement, Repeat, write_responses
+from model.estimate.measurement import MeasuredPlate, Measurement, Repeat
 from model.processes import Progress, unseen
+from model.response_files import write_responses
 from model.rig.rig import Rig
 
 _LEVEL = 0.3  # usual largest sample of each output

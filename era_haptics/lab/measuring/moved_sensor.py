@@ -24,7 +24,8 @@ from era_haptics.lab.measuring.sound_card import DeviceLost, SoundCard
 from model.arrays import ComplexArray, FloatArray
 from model.commands.options import Stopwatch
 from model.errors import InputError
-from model.estimate.measurement import Measurement, measurement_of, read_measured, write_responses
+from model.estimate.measurement import Measurement
+from model.response_files import measurement_of, read_measured, write_responses
 
 _MIN_CHANGE = 0.02  # of the response, after a move; or so many times its noise:
 _NOISE_FACTOR = 3.0

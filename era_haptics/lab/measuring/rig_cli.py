@@ -214,8 +214,9 @@ def _read_measured_plate(path: Path, rig: "Rig") -> "MeasuredPlate":
 
     Raises InputError for inconsistent responses.
     """
-    from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured
+    from model.estimate.measurement import MeasuredPlate
     from model.estimate.screening import check_consistency
+    from model.response_files import measurement_of, read_measured
 
     measurement = measurement_of(read_measured(path), rig)
     screened = check_consistency(rig, measurement)
@@ -421,7 +422,7 @@ def check(
 
 def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Measurement]":
     """Read a measurement from a file."""
-    from model.estimate.measurement import measurement_of, read_measured
+    from model.response_files import measurement_of, read_measured
     from model.rig.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from model.errors import InputError
 from model.estimate.forward import Sensor
-from model.estimate.measurement import PLACE_COLUMNS, named_place, sensor_mass
 from model.files.csv_file import CsvLine, read_lines
+from model.response_files import PLACE_COLUMNS, named_place, sensor_mass
 from model.structure.plate import Plate
 
 _REQUIRED_COLUMNS = (*PLACE_COLUMNS, "input", "mv_per_m_s2")

@@ -13,9 +13,10 @@ from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.multisine import multisine_frequencies
 from era_haptics.lab.measuring.sensor_file import are_positions
 from model.arrays import FloatArray
-from model.estimate.measurement import Measurement, write_responses
+from model.estimate.measurement import Measurement
 from model.quantities import counted
 from model.reduction.free_plate import solve_free_plate
+from model.response_files import write_responses
 from model.structure.attachments import PointLoad
 from sim.plant.imperfections import draw_imperfections
 

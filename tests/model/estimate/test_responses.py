@@ -16,11 +16,10 @@ from kit.desk_plate import DeskModel, draw_truth
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.measurement import (
-    Measurement,
+from model.estimate.measurement import Measurement, sensors_at
+from model.response_files import (
     measurement_of,
     read_measured,
-    sensors_at,
     write_responses_csv,
     write_responses_uff,
 )

@@ -39,20 +39,18 @@ from model.errors import InputError
 from model.estimate import hypotheses
 from model.estimate.calibrate import calibrate
 from model.estimate.check_report import as_json, channel_table, verdict_rows
-from model.estimate.measurement import (
-    MeasuredPlate,
-    Measurement,
-    measurement_of,
-    read_measured,
-    sensors_at,
-    write_responses,
-    write_responses_csv,
-    write_responses_uff,
-)
+from model.estimate.measurement import MeasuredPlate, Measurement, sensors_at
 from model.estimate.rig_check import check_meaning, diagnose, judged_by_promises
 from model.estimate.screening import check_consistency
 from model.estimate.sensed_plate import sensed_plate
 from model.fem import Mesh
+from model.response_files import (
+    measurement_of,
+    read_measured,
+    write_responses,
+    write_responses_csv,
+    write_responses_uff,
+)
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.rig.rig_writing import change_rig

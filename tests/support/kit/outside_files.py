@@ -31,9 +31,9 @@ from era_haptics.lab.measuring.sensor_file import read_sensors
 from kit.plates import small_table
 from model.config.document import parse_document
 from model.errors import InputError
-from model.estimate.measurement import read_measured, read_places
 from model.files.modal_file import read_modes
 from model.files.uff import read_measured_bytes
+from model.response_files import read_measured, read_places
 from model.rig.rig_file import base_fingerprint, example_rig_path, load_rig
 from model.table.table_file import load_table, save_table
 from registry.command_line import BUG

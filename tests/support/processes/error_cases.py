@@ -30,7 +30,7 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from era_haptics.command import run_era
 from kit.plates import DISTORTIONS, every
-from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
+from model.response_files import measurement_of, read_measured, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
 from processes.gateways import real_daemon, wait_for
 

@@ -29,7 +29,7 @@ from era_haptics.lab.measuring.sound_card import SoundCard
 from examples.make_measured import Accelerometer, record_responses
 from kit.desk_plate import Converters, DeskModel, DeskPlate, Truth
 from model.errors import InputError
-from model.estimate.measurement import measurement_of, read_measured
+from model.response_files import measurement_of, read_measured
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

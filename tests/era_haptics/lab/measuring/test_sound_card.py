@@ -33,7 +33,8 @@ from kit.desk_plate import (
 )
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
-from model.estimate.measurement import MeasuredPlate, measurement_of, read_measured
+from model.estimate.measurement import MeasuredPlate
+from model.response_files import measurement_of, read_measured
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.structure.attachments import PointLoad

@@ -1,11 +1,11 @@
-"""Result of a calibration: the fitted rig with its gains and uncertainty, and diagnostics.
+"""Result of a calibration: the fitted rig with its gains, its uncertainty, and diagnostics.
 
-The rig contains only values that a rig file can express. Its uncertainty covers the rest: errors of
-the fit, and form errors.
+The rig contains only values that a rig file can express. Its uncertainty covers the rest
+(`model.estimate.calibration_uncertainty`). The fit is validated at sensors that are held out.
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
 from typing import Any
@@ -15,29 +15,18 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, Point, rms
 from model.config.document import KeyPath
+from model.estimate.calibration_uncertainty import CalibrationUncertainty, is_clear
 from model.estimate.fit import HELD_OUT_FOLDS, Fit, JointPrior, fit
 from model.estimate.gains import gains_of, row_rms
 from model.estimate.measurement import LEAST_SENSORS, Measurement
 from model.estimate.noise import fit_to_noise
-from model.estimate.parameters import FORM_ERRORS, MASS_CELLS, PARAMETER_KINDS, jacobian
+from model.estimate.parameters import FORM_ERRORS, jacobian
 from model.estimate.sensed_plate import Parameter, SensedPlate, errors_by_key
 from model.files.csv_file import as_frame
-from model.rig.rig import Rig, Uncertainty
+from model.rig.rig import Rig
 
 MAX_PREDICTION_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
-
-_MIN_UNCERTAINTY = 1e-4  # no fit is exact
-_MAX_LOSS_ERROR = 100.0  # of a logarithm; a loss that is fitted as nearly zero has a larger one
-
-# Relative model errors: of all values except the loss factor, and of the loss factor. Unmodeled
-# form errors widen resonances by 0.4 % (RMS over plates without noise).
-_MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
-# Of all cells together, relative to the plate's mass.
-_FOREIGN_MASS = PARAMETER_KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)
-
-_AT_BOUND = 1e-6  # largest distance of x from its bound
-_CLEAR = 3.0  # standard errors of a significant difference
 
 
 @dataclass(frozen=True)
@@ -112,34 +101,26 @@ class Calibration:
                 if abs(gain) > 0:
                     measured.append((frequency, abs(gain), float(np.angle(gain))))
             eras.append(replace(era, gains=tuple(measured) or era.gains))
-        return replace(self._fitted, eras=tuple(eras), uncertainty=self._uncertainty)
+        unexplained = self.held_out.unexplained if self.held_out else 0.0
+        uncertainty = self.uncertainty.of_rig(unexplained)
+        return replace(self._fitted, eras=tuple(eras), uncertainty=uncertainty)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Fitted values, with errors from the fit, the model and the total mass."""
+        return self.uncertainty.parameters
 
     @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Fitted values, with errors from the fit, the model and the total mass.
+    def uncertainty(self) -> CalibrationUncertainty:
+        """Errors of the fitted values, gains and fields."""
+        return CalibrationUncertainty(self.fit, self._plain)
 
-        All fitted values except losses scale with the total mass, which responses cannot determine.
-        """
-        plate = self.plate
-        x = self.fit.x
-        mass_error = math.hypot(_FOREIGN_MASS, *(PARAMETER_KINDS["side"].std / plate.sides))
-        bounds = np.array([plate.space.lower, plate.space.upper])
-        is_at_bound = np.abs(bounds - x).min(axis=0) < _AT_BOUND
-        values = plate.values(x).tolist()
-        errors = plate.errors(x, self.fit.errors).tolist()
-        fitted = []
-        for number, original in enumerate(plate.parameters):
-            index = plate.numbers[number]
-            model_error = math.hypot(_MODEL_ERROR, mass_error)
-            if original.kind == "loss_factor":
-                model_error = self._loss_error
-            parameter = replace(original, value=values[number])
-            if self.fit.searched[index]:
-                error = math.hypot(errors[number], model_error * values[number])
-                at_bound = bool(is_at_bound[index])
-                parameter = replace(parameter, standard_error=error, at_bound=at_bound)
-            fitted.append(parameter)
-        return tuple(fitted)
+    @cached_property
+    def gains_error(self) -> FloatArray:
+        """Standard errors of the rig's gains (f, eras), NaN where not measured."""
+        size = np.abs(self.gains_of_fit)
+        fit_error = size * self.uncertainty.relative_gain_errors
+        return np.asarray(np.hypot(fit_error, np.abs(self._gains) - size))
 
     @property
     def moved(self) -> dict[str, tuple[Point, Point]]:
@@ -153,15 +134,6 @@ class Calibration:
                 x_error, y_error = errors[number]
                 moved[era.name] = ((era.x, era.y), (x_error, y_error))
         return moved
-
-    @cached_property
-    def gains_error(self) -> FloatArray:
-        """Standard errors of the rig's gains (f, eras), NaN where not measured."""
-        slopes, noise_variance = self._gain_changes
-        variance = _variances(slopes.real, self.fit.covariance, self.fit.searched)
-        size = np.abs(self.gains_of_fit)
-        fit_error = size * np.sqrt(noise_variance + variance)
-        return np.asarray(np.hypot(fit_error, np.abs(self._gains) - size))
 
     @property
     def scales(self) -> dict[str, tuple[float, float]]:
@@ -188,11 +160,6 @@ class Calibration:
     def error(self) -> float:
         """Relative error of the fit with form errors; see `HeldOutSensors`."""
         return self._relative_error(self.fit.predicted, self.measurement.known)
-
-    @property
-    def chi2(self) -> float:
-        """chi² per degree of freedom; about 1 for a good fit."""
-        return self.fit.chi2
 
     @property
     def measurement(self) -> Measurement:
@@ -274,7 +241,7 @@ class Calibration:
         gains (f, eras): of the prediction.
         """
         of_sensors = self.plate.space.of("sensor_scale", "sensor_place")
-        slopes = jacobian(self.plate.at(self.fit.x), of_sensors)[..., of_sensors]
+        slopes = jacobian(self.fit.fitted_plate, of_sensors)[..., of_sensors]
         variance = (np.abs(gains[:, None, :, None] * slopes) ** 2).sum(axis=-1)
         return np.asarray(variance + 2 * self.measurement.std**2)
 
@@ -320,11 +287,6 @@ class Calibration:
         return rms(errors[valid])
 
     @cached_property
-    def is_clear(self) -> NDArray[np.bool_]:
-        """Mask of the parameters that differ from the rig by several standard errors (p,)."""
-        return np.abs(self.fit.x) > _CLEAR * self.fit.errors
-
-    @cached_property
     def _plain(self) -> Fit[SensedPlate]:
         """Fit of the plate without form errors, which a rig file cannot express.
 
@@ -335,7 +297,7 @@ class Calibration:
         refitted = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
         form_errors = space.of(*FORM_ERRORS, "mode_shifts") & ~refitted
         x = self.fit.x.copy()
-        x[form_errors | (space.of("place") & ~self.is_clear)] = 0.0
+        x[form_errors | (space.of("place") & ~is_clear(self.fit))] = 0.0
         searched = self.fit.searched & refitted
         return fit(self.plate, self.measurement, searched=searched, start=x, prior=self.prior)
 
@@ -354,180 +316,8 @@ class Calibration:
     @cached_property
     def _gains(self) -> ComplexArray:
         """Best-fitting gains for these responses (f, eras), NaN if not measured."""
-        return self._gains_for(self._fields * self.sensor_scales[:, None])
-
-    def _gains_for(self, model: ComplexArray) -> ComplexArray:
-        """Best-fitting gains (f, eras) for responses (f, s, eras), NaN if not measured."""
-        return gains_of(model, self.measurement.values, self.measurement.weight)
-
-    @cached_property
-    def _gain_changes(self) -> tuple[ComplexArray, FloatArray]:
-        """Relative change of the gains per searched parameter (f, eras, q), and their variance due
-        to noise (f, eras)."""
-        fit = self.fit
-        power = (np.abs(self.measurement.weight * fit.predicted) ** 2).sum(axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slopes = fit.gain_slopes / fit.gains[..., None]
-            noise_variance = np.where(power > 0, max(fit.chi2, 1.0) / power, np.nan)
-        # A force factor and the gain are fitted together: only their product moves the plate.
-        space = self.plate.space
-        numbers = np.flatnonzero(fit.searched)
-        for era, number in enumerate(space.indices("force_factor")):
-            slopes[:, era, numbers == number] += space.std[number]
-        return slopes, noise_variance
-
-    @cached_property
-    def _loss_error(self) -> float:
-        """Relative model error of the loss factor, including the effect of all dampers."""
-        plate = self.plate
-        kinds = np.array([parameter.kind for parameter in plate.parameters])
-        std = plate.space.std[plate.numbers]
-        values = plate.values(self.fit.x) / np.where(std > 0, std, 1.0)
-        size = np.where(values > 0, values, np.inf)
-        covariance = self.fit.covariance[np.ix_(plate.numbers, plate.numbers)]
-        relative = covariance / np.outer(size, size)
-        dampers = (kinds == "damping") & self.fit.searched[plate.numbers]
-        with_loss = relative[dampers][:, kinds == "loss_factor"].sum(axis=1)
-        slopes, *_ = np.linalg.lstsq(relative[np.ix_(dampers, dampers)], with_loss)
-        return math.hypot(_LOSS_ERROR, _MODEL_ERROR * float(slopes.sum()))
-
-    @cached_property
-    def _uncertainty(self) -> Uncertainty:
-        """Uncertainty of the calibrated rig, for its file.
-
-        Excludes the error of the total mass, which scales all values and changes no pattern.
-        Thickness represents the plate's rigidity: 1 % of modulus shifts modes like 0.5 % of
-        thickness. Values that are not identified keep the original uncertainty.
-        """
-        original = self.plate.rig.uncertainty
-        loss = self._kind_error("loss_factor", model_error=self._loss_error)
-        loss = max(loss, self._kind_error("damping"))
-        if loss < math.inf:
-            loss = min(loss, _MAX_LOSS_ERROR)
-        errors = self._field_errors | {
-            "place": self._place_error,
-            "stiffness": self._kind_error("stiffness"),
-            "damping": math.expm1(loss),
-        }
-        if any(parameter.foot for parameter in self.parameters):
-            unidentified = math.hypot(original.supports, _MODEL_ERROR)
-            errors["supports"] = self._kind_error("supports", unidentified=unidentified)
-        # An error is rarely known to more than two digits.
-        rounded = {}
-        for key, error in errors.items():
-            if error < math.inf:
-                rounded[key] = float(f"{error:.2g}")
-        if "damping" in rounded:
-            rounded["damping"] += 1
-        if self.parameters[0].is_identified:
-            rounded |= Uncertainty.of_frequency(float(f"{self._modulus_error / 2:.2g}"))
-        return Uncertainty.clipped(**asdict(original) | rounded)
-
-    def _kind_error(
-        self, kind: str, *, model_error: float = _MODEL_ERROR, unidentified: float = math.inf
-    ) -> float:
-        """Relative RMS error of all values of a kind; unidentified: of a value not identified."""
-        # An exciter's coil both damps and drives; the contribution of its suspension hardly shows
-        # alone.
-        exciters = {parameter.era for parameter in self.plate.exciter_parameters}
-        errors = self.plate.errors(self.fit.x, self.fit.errors).tolist()
-        relative = []
-        for parameter, error in zip(self.parameters, errors, strict=True):
-            is_coil = parameter.kind == "damping" and parameter.era in exciters
-            if parameter.kind != kind or is_coil:
-                continue
-            if not parameter.is_identified:
-                relative.append(unidentified)
-            elif parameter.value > 0:
-                relative.append(math.hypot(error / parameter.value, model_error))
-        return rms(relative)
-
-    @property
-    def _modulus_error(self) -> float:
-        """Relative error of the fitted modulus as a value that reproduces the natural frequencies.
-
-        It includes the effect of form errors on these.
-        """
-        x = self._plain.x
-        error = self.plate.errors(x, self._plain.errors)[0]
-        return math.hypot(error / self.plate.values(x)[0], _MODEL_ERROR)
-
-    @property
-    def _field_errors(self) -> dict[str, float]:
-        """Errors of gains and fields by key of `uncertainty`; missing if an ERA has no gain.
-
-        `field` is the part of the fitted fields that the rig cannot express (form errors), and at
-        least the unexplained error at held-out sensors. `gain` and `phase` are the errors of the
-        best gains for such fields, as measured by the sensors; other errors change gains and fields
-        in opposite directions.
-        """
-        slopes, noise_variance = self._gain_changes
-        covariance = self.fit.covariance
-        # Other fitted parameters change gain and field in opposite directions: sensors measure the
-        # product.
-        of_sensors = self.plate.space.of("sensor_scale", "sensor_place") & self.fit.searched
-        slopes = slopes[..., of_sensors[self.fit.searched]]
-        common = np.nanmean(slopes, axis=(0, 1))
-        single = slopes - common
-        magnitude = np.sqrt(noise_variance + _variances(single.real, covariance, of_sensors))
-        phase = np.sqrt(noise_variance + _variances(single.imag, covariance, of_sensors))
-        missing = self._missing_fields
-        valid = np.isfinite(magnitude) & np.isfinite(missing)
-        if not valid.any(axis=0).all():
-            return {}
-        field = rms(missing[valid])
-        if self.held_out:
-            field = max(field, self.held_out.unexplained)
-        # Error of the best gain if the field at n sensors has this error. Except at resonances,
-        # wrong masses and stiffness change a field in phase with it.
-        gain = field / np.sqrt(self.measurement.known.sum(axis=1)[valid])
-        gain_error = rms(np.hypot(gain, magnitude[valid]))
-        phase_error = rms(np.hypot(math.sqrt(0.5) * gain, phase[valid]))
-        return {
-            "gain": max(gain_error, _MIN_UNCERTAINTY),
-            "phase_deg": math.degrees(max(phase_error, _MIN_UNCERTAINTY)),
-            "field": field,
-            "common_gain": math.sqrt(_variances(common.real, covariance, of_sensors)),
-        }
-
-    @property
-    def _missing_fields(self) -> FloatArray:
-        """Part of the fitted responses that the rig cannot express, relative (f, eras).
-
-        ERAs stay at their fitted positions, since a rig states position errors separately.
-        """
-        x = np.where(self.plate.space.of("place"), self.fit.x, self._plain.x)
-        model = self.plate.responses(x)
-        predicted = self.fit.predicted
-        missing = self._gains_for(model)[:, None] * model - predicted
-        valid = self.measurement.known
-        missing_power = np.where(valid, np.abs(missing) ** 2, 0.0).sum(axis=1)
-        power = np.where(valid, np.abs(predicted) ** 2, 0.0).sum(axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.sqrt(missing_power / power))
-
-    @property
-    def _place_error(self) -> float:
-        """RMS error of the ERA positions in the rig, per coordinate [m].
-
-        If the fitted position is not significant, the error of the original position counts. If the
-        data determine a position less well than its prior, the original uncertainty counts.
-        """
-        space = self.plate.space
-        kind = PARAMETER_KINDS["place"]
-        ignored = space.values(np.where(self.is_clear, 0.0, self.fit.x), "place")
-        error = space.values(self.fit.errors, "place")
-        total = np.hypot(np.hypot(ignored, error), kind.theory)
-        is_measured = error < math.sqrt(0.5) * kind.std
-        return rms(np.where(is_measured, total, self.plate.rig.uncertainty.place))
-
-
-def _variances(
-    slopes: FloatArray, covariance: FloatArray, searched: NDArray[np.bool_]
-) -> FloatArray:
-    """Return variances (...) of functions of masked parameters (p,), from slopes (..., q)."""
-    selected = covariance[np.ix_(searched, searched)]
-    return np.asarray(((slopes @ selected) * slopes).sum(axis=-1))
+        responses = self._fields * self.sensor_scales[:, None]
+        return gains_of(responses, self.measurement.values, self.measurement.weight)
 
 
 def calibration_errors(calibration: Calibration) -> dict[KeyPath, float]:

@@ -28,7 +28,7 @@ def change_rows(calibration: Calibration) -> list[str]:
                 name=f"{name} place",
                 fitted=f"{_millimeters(position)} mm",
                 standard_error=f"± {_millimeters(error)} mm",
-                before=f"{_millimeters((era.x, era.y))} mm",
+                value_before=f"{_millimeters((era.x, era.y))} mm",
                 note="",
             )
         )
@@ -52,7 +52,7 @@ def _parameter_row(parameter: Parameter, confused: str) -> TableRow:
         name=parameter.name,
         fitted=f"{fitted.value} {fitted.unit}".strip(),
         standard_error=f"± {fitted.error} {fitted.unit}".strip(),
-        before=value_before,
+        value_before=value_before,
         note=", ".join(notes),
     )
 

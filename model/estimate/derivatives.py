@@ -126,8 +126,8 @@ class ResponseDerivatives:
         truncated = plate.free.receptance.truncated(TERMS)
         rows = located.shape_slopes @ plate.coordinates
         rows = rows + combined(truncated, located.truncated_slopes)
-        motion = plate.left @ rows.swapaxes(1, 2)
-        column = plate.left[:, :, np.repeat(plate.model.movable, 2)]
+        motion = plate.coupling @ rows.swapaxes(1, 2)
+        column = plate.coupling[:, :, np.repeat(plate.model.movable, 2)]
         ones = np.ones((len(plate.model.omega), 1))
         return self._rank_one(column, motion, ones) + self._rank_one(motion, column, ones)
 
@@ -161,7 +161,7 @@ class ResponseDerivatives:
         modes = plate.model.modes
         sums = modes.truncated_terms(plate.attachments.footprints, points)
         truncated = combined(plate.free.receptance.truncated(TERMS), sums)
-        motion = self._modal_motion @ modes.shapes_at(points).T + plate.left @ truncated
+        motion = self._modal_motion @ modes.shapes_at(points).T + plate.coupling @ truncated
         return self._rank_one(motion, motion, plate.model.omega[:, None] ** 2)
 
     def attachment_stiffness(self, attachments: IntArray, changes: AnyArray) -> ComplexArray:
@@ -186,7 +186,7 @@ class ResponseDerivatives:
     @cached_property
     def _modal_motion(self) -> ComplexArray:
         """Motion of the attachments for a force on each free mode (f, a, r) [s²/kg]."""
-        return self.plate.left @ self.plate.coordinates.swapaxes(1, 2)
+        return self.plate.coupling @ self.plate.coordinates.swapaxes(1, 2)
 
     @property
     def _modal_motions(self) -> tuple[ComplexArray, ComplexArray]:
@@ -205,7 +205,7 @@ class ResponseDerivatives:
 
     def _receptance_change(self, free_change: ComplexArray) -> ComplexArray:
         """Return L dA L^T (f, s, c) for a change dA of the free receptance (f, a, a)."""
-        left = self.plate.left
+        left = self.plate.coupling
         observed = left[:, self.plate.model.observed]
         return observed @ free_change @ left[:, self._driven].swapaxes(1, 2)
 
@@ -214,8 +214,8 @@ class ResponseDerivatives:
 
         u and v (f, a, m): columns over the attachments; factor (f, m).
         """
-        left = u[:, self.plate.model.observed] * factor[:, None]
-        return self._response_change(left[:, :, None] * v[:, None, self._driven])
+        rows = u[:, self.plate.model.observed] * factor[:, None]
+        return self._response_change(rows[:, :, None] * v[:, None, self._driven])
 
     def _response_change(self, change: AnyArray) -> ComplexArray:
         """Return changes of the responses (f, s, n, ...) for a change of T (f, s, c, ...)."""

@@ -22,7 +22,7 @@ class TableRow(NamedTuple):
     name: str
     fitted: str
     standard_error: str
-    before: str
+    value_before: str
     note: str
 
 

@@ -405,13 +405,13 @@ class PlateAt:
         return np.asarray(A[:, :, :count] @ forces * Z[:, None])
 
     @cached_property
-    def left(self) -> ComplexArray:
+    def coupling(self) -> ComplexArray:
         """L = 1 - T Z, motion with attachments relative to that of the free plate (f, a, a)."""
         reaction = self._reaction
         frequencies, count, stiff_count = reaction.shape
-        left = np.repeat(np.eye(count, dtype=complex)[None], frequencies, axis=0)
-        left[:, :, :stiff_count] -= reaction
-        return left
+        coupling = np.repeat(np.eye(count, dtype=complex)[None], frequencies, axis=0)
+        coupling[:, :, :stiff_count] -= reaction
+        return coupling
 
     @cached_property
     def receptance(self) -> ComplexArray:

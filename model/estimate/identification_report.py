@@ -107,7 +107,7 @@ def _difference_row(parameter: Parameter, standard_error: float, confused: str) 
         name=parameter.name,
         fitted=f"{fitted.value}{unit}",
         standard_error=f"± {fitted.error}{unit}",
-        before=f"± {float(f'{parameter.prior:.2g}'):g}{unit}",
+        value_before=f"± {float(f'{parameter.prior:.2g}'):g}{unit}",
         note=note,
     )
 

@@ -1,10 +1,7 @@
 """Identify a rig from responses measured in place: its values, their covariance and uncertainty.
 
-`model.estimate.staged_fit` finds the most likely parameters. A response to a moving base does not
-change if mass, springs and dampers are scaled together, and neither does a contrast if all drives
-are. Answers depend on each natural frequency, on each spring and damper relative to the plate's
-mass, and on each gain relative to the others. Levels depend on the mean of the gains, but responses
-determine only its product with the mean sensor gain (`relevant`).
+`model.estimate.staged_fit` finds the most likely parameters. The measurement must determine the
+quantities that answers depend on (`model.estimate.relevant_quantities`).
 
 The fit is validated on held-out paths from an ERA to a sensor, in five folds; the reverse of a
 held-out path is held out as well. Held-out paths show the error of fields that are not measured.
@@ -12,8 +9,7 @@ Held-out tones would show only whether a resonance was measured, which the covar
 Only the part of the error that neither noise nor uncertain parameters explain counts against the
 model. It also makes fits to different paths disagree in their parameters beyond their covariance (a
 jackknife over groups: B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans, SIAM 1982,
-ch. 3). If the measurement leaves a quantity unknown, `unknowns` names the tone and the sensor that
-would determine it.
+ch. 3).
 """
 
 import math
@@ -24,18 +20,24 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray, best_of, rms
+from model.arrays import FloatArray, rms
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.fit import HELD_OUT_FOLDS, fit
-from model.estimate.forward import ForwardModel, PlateAt, Sensor
 from model.estimate.gains import are_impossible
 from model.estimate.measurement import Measurement
 from model.estimate.parameter_space import PlateValues, Space
-from model.estimate.parameters import PARAMETER_KINDS, jacobian
+from model.estimate.parameters import jacobian
+from model.estimate.relevant_quantities import (
+    parameter_stds,
+    relevant_stds,
+    std_of,
+    unit_rows,
+    unknowns,
+)
 from model.estimate.rig_parameters import rig_with
 from model.estimate.sensed_plate import errors_by_key, parameters_of
-from model.estimate.staged_fit import RigFit, fit_board, mode_shift, model_of
+from model.estimate.staged_fit import RigFit, fit_board, mode_shift
 from model.processes import Progress, unseen
 from model.rig.rig import Rig, Uncertainty
 from model.structure.modal_elasticity import check_measurable
@@ -57,31 +59,10 @@ _GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)
 # Of the common factor of all responses; g is 9.8 m/s², an inch 25.4 mm.
 _LEVEL_ALLOWED = math.log(2.5)
 
-_THEORY = {
-    "frequency": PARAMETER_KINDS["mode_shifts"].theory / 2,
-    "stiffness": PARAMETER_KINDS["stiffness"].theory,
-    "damping": PARAMETER_KINDS["damping_each"].theory,
-    "place": PARAMETER_KINDS["place"].theory,
-}
-
 _MAX_PREDICTION_STD = 0.1  # of the RMS at a tone; less certain predictions prove nothing
 _MIN_PREDICTED = 16  # values
 _REFITTED = 8  # evaluations of a fit to the remaining paths
 _IN_COMMON = 2.0  # factor on standard errors, for errors that all fits share and no path shows
-
-_UNKNOWN = 0.5
-"""Fraction of the prior above which a quantity counts as not identified.
-
-If the rig states less, the prior is the one for an unmeasured plate: answers need no more.
-"""
-
-# Hz; above it, a 20 % error of a suspension changes fields by less than 5 %.
-_SUSPENSION_FELT = 120.0
-
-_ADVISED_STEP = 20.0  # Hz between candidate tones for advice
-_ADVISED_NOISE = 0.01  # of the RMS of the responses at a tone
-# Of the sides, candidate positions of additional sensors for advice.
-_ADVISED_PLACES = (0.13, 0.5, 0.87)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,22 +127,12 @@ class Identification:
     @cached_property
     def std(self) -> FloatArray:
         """Standard error of each parameter in its unit (p,)."""
-        return _parameter_stds(self.fitted.space, self.covariance)
+        return parameter_stds(self.fitted.space, self.covariance)
 
     def stds(self) -> dict[str, FloatArray]:
         """Standard errors of the quantities that answers depend on, with model errors, by
         kind."""
-        return _relevant_stds(self.fitted.space, self.covariance)
-
-    def within(self, space: Space) -> tuple[FloatArray, FloatArray]:
-        """Return parameters (p,) and covariance (p, p) in a larger space; additional ones are 0 and
-        exactly known."""
-        numbers = [space.index(name) for name in self.fitted.space.names]
-        x = np.zeros(space.size)
-        x[numbers] = self.fitted.x
-        covariance = np.zeros((space.size, space.size))
-        covariance[np.ix_(numbers, numbers)] = self.covariance
-        return x, covariance
+        return relevant_stds(self.fitted.space, self.covariance)
 
     def uncertainty(self, unexplained: float) -> Uncertainty:
         """Return the `uncertainty` of the identified rig.
@@ -174,9 +145,9 @@ class Identification:
         space = self.fitted.space
         covariance = self.fitted.stated_covariance
         original = self.fitted.model.rig.uncertainty
-        mean_gain = _rows(space, "gain").mean(axis=0, keepdims=True)
+        mean_gain = unit_rows(space, "gain").mean(axis=0, keepdims=True)
         mean_gain_std = std_of(mean_gain, space, covariance)[0]
-        stds = _relevant_stds(space, covariance)
+        stds = relevant_stds(space, covariance)
         errors = {kind: rms(std) for kind, std in stds.items()}
         return Uncertainty.clipped(
             gain=math.hypot(errors["gain"], _DRIVE_GAIN),
@@ -189,25 +160,10 @@ class Identification:
             field=unexplained,
             place=errors["place"],
             harmonic=original.harmonic,
-            supports=rms(_parameter_stds(space, covariance)[space.groups["supports"]]),
+            supports=rms(parameter_stds(space, covariance)[space.groups["supports"]]),
             weather=original.weather,
             foreign_mass=original.foreign_mass,
         )
-
-
-def _parameter_stds(space: Space, covariance: FloatArray) -> FloatArray:
-    """Return the standard error of each parameter in its unit (p,)."""
-    return space.std * np.sqrt(np.diagonal(covariance))
-
-
-def _relevant_stds(space: Space, covariance: FloatArray) -> dict[str, FloatArray]:
-    """Return standard errors of the quantities that answers depend on, with model errors, by
-    kind."""
-    stds = {kind: std_of(rows, space, covariance) for kind, rows in relevant(space).items()}
-    stds["place"] = _parameter_stds(space, covariance)[space.groups["place"]]
-    for kind, std in stds.items():
-        stds[kind] = np.where(std > 0, np.hypot(std, _THEORY.get(kind, 0.0)), 0.0)
-    return stds
 
 
 def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen) -> Identification:
@@ -233,7 +189,7 @@ def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen)
     _check_level(values)
     if identification.is_explained:
         _check_gains(board, measurement, values, fitted.space)
-    unknown = unknowns(identification)
+    unknown = unknowns(fitted)
     if unknown:
         raise InputError("measurement must show more: " + "; ".join(unknown))
     held_out = hold_out(fitted, progress=progress)
@@ -326,40 +282,6 @@ def _wrong_gains(
     return wrong
 
 
-def relevant(space: Space) -> dict[str, FloatArray]:
-    """Return combinations (m, p) of parameters that answers depend on, by name."""
-    mass = _rows(space, "thickness")
-    rigidity = mass + _rows(space, "modulus") / 2
-    gain = _rows(space, "gain")
-    phase = _rows(space, "phase")
-    damping = _rows(space, "damping_each") + _rows(space, "damping") - mass
-    factor = space.groups["force_factor"]
-    if factor.stop > factor.start:
-        # An exciter's coil both damps and drives; the contribution of its suspension hardly shows
-        # alone.
-        damping = damping[space.std[factor] == 0]
-        gain = gain + _rows(space, "force_factor")
-    return {
-        "frequency": rigidity + _rows(space, "mode_shifts") / 2,
-        "stiffness": _rows(space, "stiffness") - mass,
-        "damping": damping,
-        "loss": _rows(space, "loss") + _rows(space, "mode_losses"),
-        "gain": gain - gain.mean(axis=0),
-        "phase": phase - phase.mean(axis=0),
-    }
-
-
-def _rows(space: Space, kind: str) -> FloatArray:
-    """Return one row per parameter of a kind, (m, p)."""
-    return np.eye(space.size)[space.groups[kind]]
-
-
-def std_of(combinations: FloatArray, space: Space, covariance: FloatArray) -> FloatArray:
-    """Return standard errors (m,) of linear combinations (m, p) of parameters in their units."""
-    scaled = combinations * space.std
-    return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, covariance, scaled)))
-
-
 def hold_out(result: RigFit, *, progress: Progress = unseen) -> HeldOutPaths | None:
     """Predict paths from fits to the others; None if the fits determine too few paths."""
     measurement = result.measurement
@@ -419,105 +341,6 @@ def _prediction_variance(partial: RigFit, hidden: NDArray[np.bool_]) -> FloatArr
 def _positive_root(squares: FloatArray) -> float:
     """Return the root of a mean square, 0 if noise that was subtracted exceeds the errors."""
     return math.sqrt(max(squares.mean(), 0.0))
-
-
-def unknowns(identification: Identification) -> list[str]:
-    """Describe quantities that answers depend on but the measurement leaves unknown, with advice.
-
-    States their standard errors before and after the measurement.
-    """
-    space = identification.fitted.space
-    prior = np.diag(space.uncertain.astype(float))
-    rows = []
-    for kind, combinations in relevant(space).items():
-        prior_std = std_of(combinations, space, prior)
-        std = std_of(combinations, space, identification.covariance)
-        built_std = std_of(combinations, space.as_built, prior)
-        is_unknown = (prior_std > 0) & (std > _UNKNOWN * built_std)
-        unknown = np.flatnonzero(is_unknown & _are_needed(identification.fitted.model, kind))
-        # Losses and frequencies of single modes count only if no tone has shown them.
-        is_of_modes = kind in ("frequency", "loss")
-        if not len(unknown) or (is_of_modes and len(unknown) < len(combinations)):
-            continue
-        worst = unknown[best_of(std[unknown])]
-        name = kind
-        if not is_of_modes:
-            name = space.names[best_of(np.abs(combinations[worst]))]
-        rows.append(
-            f"{name}: known to {_error_text(kind, std[worst])}, "
-            f"before {_error_text(kind, prior_std[worst])}; "
-            f"{_advice(identification, combinations[worst])}"
-        )
-    return rows
-
-
-def _are_needed(model: ForwardModel, kind: str) -> NDArray[np.bool_]:
-    """Return whether tones depend on the quantities of a kind, (m,) or () for all.
-
-    Tones far above the resonance of an exciter do not depend on the stiffness of its suspension.
-    """
-    if kind != "stiffness" or model.frequencies[0] <= _SUSPENSION_FELT:
-        return np.array(True)
-    return np.array(["force_factor" not in era.fields for era in model.rig.eras])
-
-
-def _error_text(kind: str, std: float) -> str:
-    """Format a standard error of a kind in `relevant`: phases in degrees, others in per cent."""
-    if kind == "phase":
-        return f"{math.degrees(std):.2g}°"
-    return f"{100 * std:.2g} %"
-
-
-def _advice(identification: Identification, combination: FloatArray) -> str:
-    """Describe the ERA, tone and position whose response would narrow a combination (p,) most."""
-    space = identification.fitted.space
-    model = _advised_model(identification.fitted)
-    x, covariance = identification.within(model.space)
-    numbers = [model.space.index(name) for name in space.names]
-    is_new = model.space.std > 0
-    is_new[numbers] = False
-    covariance += np.diag(is_new.astype(float))
-    direction = np.zeros(model.space.size)
-    direction[numbers] = combination
-    narrowed = _narrowing(model.at(x), covariance, covariance @ (direction * model.space.std))
-    f, s, e = map(int, np.unravel_index(best_of(narrowed.ravel()), narrowed.shape))
-    era = model.rig.eras[e].name
-    sensor = model.sensors[s]
-    place = f"ERA {sensor.era}" if sensor.era else f"({sensor.x:.3g}, {sensor.y:.3g}) m"
-    return f"play ERA {era} at {model.frequencies[f]:.0f} Hz and measure at {place}"
-
-
-def _advised_model(fitted: RigFit) -> ForwardModel:
-    """Return the model with all tones and sensors that advice can name."""
-    model = fitted.model
-    measured = {sensor.era for sensor in model.sensors}
-    more = []
-    for era in model.rig.eras:
-        if era.name not in measured:
-            more.append(Sensor(f"ERA {era.name}", era.name))
-    length, width = model.sides.tolist()
-    for x in _ADVISED_PLACES:
-        for y in _ADVISED_PLACES:
-            more.append(Sensor(f"{x:g} {y:g}", x=x * length, y=y * width))
-    limits = model.rig.limits
-    tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _ADVISED_STEP)
-    wider = model_of(model.rig, model.free, fitted.measurement, masses=model.mass_count, more=more)
-    return replace(wider, frequencies=tones)
-
-
-def _narrowing(plate: PlateAt, covariance: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return how much each response alone reduces the variance of a combination (f, s, n).
-
-    direction (p,): covariance of the combination with all parameters.
-    """
-    mean_square = (np.abs(plate.responses) ** 2).mean(axis=(0, 2), keepdims=True)
-    noise = _ADVISED_NOISE * np.sqrt(mean_square)
-    slopes = jacobian(plate) / noise[..., None]
-    narrowed = np.zeros(plate.responses.shape)
-    for part in (slopes.real, slopes.imag):
-        variance = ((part @ covariance) * part).sum(axis=-1)
-        narrowed += (part @ direction) ** 2 / (1 + variance)
-    return narrowed
 
 
 def identification_errors(identification: Identification) -> dict[KeyPath, float]:

@@ -26,8 +26,6 @@ MAX_GUESSED = math.sqrt(0.5)
 than the data do."""
 
 VALUE_UNITS = {
-    "length": "m",
-    "width": "m",
     "thickness": "m",
     "modulus": "Pa",
     "loss_factor": "",

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from model.estimate.identify import Identification, relevant
+from model.estimate.identify import Identification
 from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.parameters import PARAMETER_KINDS
+from model.estimate.relevant_quantities import relevant
 
 Reals: TypeAlias = NDArray[np.float64]
 Complexes: TypeAlias = NDArray[np.complex128]

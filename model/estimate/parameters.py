@@ -9,7 +9,8 @@ on the rig's value. Its class defines
 - `value`: the value of the rig that they represent;
 - `derivative`: the derivatives of the plate's responses with respect to them.
 
-To add a kind, write a class and add it to `ALL_KINDS`. `tests/model/estimate/test_identify.py`
+To add a kind, write a class and add it to `ALL_KINDS`. `jacobian` collects the derivatives of all
+kinds. `tests/model/estimate/test_identify.py`
 compares every derivative with a difference quotient.
 """
 
@@ -546,7 +547,7 @@ class AddedMasses(DifferentiableKind):
             lower=np.array([0.0, *-half]),
             upper=np.array([np.inf, *half]),
         )
-        return Prior(*(np.tile(each, scope.masses) for each in one_mass))
+        return Prior(*(np.tile(values, scope.masses) for values in one_mass))
 
     def value(self, values: PlateValues) -> FloatArray:
         """Mass [kg], x and y [m] of each mass (m, 3), moved onto the plate if outside."""

@@ -9,15 +9,14 @@ metadata. Each check looks for one error among the parameters that the fit leave
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, best_by, best_of
+from model.arrays import ComplexArray
 from model.errors import InputError
 from model.estimate.findings import (
     MAX_FORM_ERROR,
@@ -27,8 +26,8 @@ from model.estimate.findings import (
     match_beyond,
     with_findings,
 )
-from model.estimate.gains import gains_of, row_rms
 from model.estimate.hypotheses import Hypothesis, compare_hypotheses
+from model.estimate.loose_exciters import channels_behind_glue, loosened_channels
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Measurement,
@@ -45,20 +44,18 @@ from model.estimate.misread_files import (
 from model.estimate.plate_match import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
-    MIN_COST_REDUCTION,
     MODEL_ERROR,
     Match,
     best_wiring,
     likeliest,
     match_plate,
 )
+from model.estimate.quantity_check import check_phases, check_quantity
 from model.estimate.sensed_plate import SensedPlate, plate_of
 from model.estimate.shape_match import ShapeMatch, match_responses, match_shapes
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
-from model.structure.exciter import Exciter
 from model.structure.sources import Era
-from model.structure.statics import GRAVITY
 from model.study.expected_contrast import promise_margins
 
 STRONG = 1.25
@@ -66,9 +63,6 @@ STRONG = 1.25
 
 That is four times the tolerance of drives.
 """
-
-LOOSE = 0.7
-"""Share of its own stiffness below which an exciter that explains a plate is loose."""
 
 MISSED_DB = 1.0
 """Largest miss of the promises of a table by half of its answers [dB]."""
@@ -86,38 +80,6 @@ _MUTE = 0.1  # of the others' scale
 _UPSIDE_DOWN = -0.5
 _MORE_NOISE = 1.2  # model error of a second match, relative to the error of the first
 _MAX_MODEL_ERROR = 0.3
-
-_GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
-_RISES = 0.2  # of the logarithm of a gain over the frequencies
-_EXPLAINS = 0.6  # of the median residual without glue
-_MIN_CHANNELS = 3  # whose median shows a common error of the amplifier
-
-_MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
-
-
-class _Quantity(NamedTuple):
-    """Quantity that responses can be by mistake: factor * (i omega)^power times the right one."""
-
-    name: str
-    remedy: str
-    factor: float
-    power: int = 0
-
-
-_RIGHT_QUANTITY = _Quantity("acceleration per displacement", "", 1.0)
-_WRONG_QUANTITIES = (
-    _Quantity("g", f"multiply by {GRAVITY}", 1 / GRAVITY),
-    _Quantity("mm/s² per m", "divide by 1000", 1e3),
-    _Quantity("m/s² per mm", "multiply by 1000", 1e-3),
-    _Quantity("m/s² per µm", "multiply by 1000000", 1e-6),
-    _Quantity("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY),
-    _Quantity("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY),
-    _Quantity("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
-    _Quantity("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
-    _Quantity("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
-    _Quantity("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
-    _Quantity("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
-)
 
 
 @dataclass(frozen=True)
@@ -165,8 +127,8 @@ def _diagnosed(rig: Rig, observation: Measurement, options: _Options) -> Verdict
     if dead.any():
         shapes = match_shapes(plate, observation.values)
     if options.refuses:
-        _check_quantity(plate, shapes, observation.values)
-        _check_phases(plate, shapes, observation.values)
+        check_quantity(plate, shapes, observation.values)
+        check_phases(plate, shapes, observation.values)
     dead |= _dead_channels(plate, observation.values, shapes)
     values = np.where(dead, np.nan, observation.values)
     if not np.isfinite(values).any():
@@ -283,9 +245,9 @@ def _matched_verdict(
     else:
         hypotheses = compare_hypotheses(nominal)
     fitted = likeliest([match, *(hypothesis.match for hypothesis in hypotheses)])
-    loose = _behind_glue(fitted)
+    loose = channels_behind_glue(fitted)
     if not plate_matches:
-        loose |= _loosened(match, hypotheses)
+        loose |= loosened_channels(match, hypotheses)
     changes = None
     if match.error <= MAX_FIT_ERROR:
         changes = plate_changes(rig, match)
@@ -458,64 +420,6 @@ def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float |
     return math.degrees(np.angle(mean)), abs(mean)
 
 
-def _loosened(match: Match, hypotheses: Sequence[Hypothesis]) -> set[int]:
-    """Return the channels of exciters that differ most, or are the likeliest hypothesis.
-
-    Each acts with less than its own stiffness.
-    """
-    rig = match.plate.rig
-    parameters = match.plate.parameters
-    farthest = parameters[best_of(np.abs(match.z))].era
-    shares = []
-    for hypothesis in hypotheses[:1]:
-        if hypothesis.era:
-            shares.append((hypothesis.era, hypothesis.value / hypothesis.expected))
-    for parameter in parameters:
-        if parameter.era and parameter.era == farthest and parameter.is_factor:
-            shares.append((parameter.era, parameter.of(match.rig) / parameter.of(rig)))
-    loose = set()
-    for era, share in shares:
-        if share <= LOOSE and isinstance(rig.era(era), Exciter):
-            loose.add(era)
-    return {n for n, number in enumerate(match.drives) if rig.eras[number].name in loose}
-
-
-def _behind_glue(match: Match) -> set[int]:
-    """Return the channels whose exciter clearly acts through a spring of glue.
-
-    A spring z between coil and plate gives gains g_f ~ G |z / (z + D(w_f))|, where the dynamic
-    stiffness D of the exciter decreases above the resonance of the magnet: the gain rises with
-    frequency. A change common to all channels comes from the amplifier.
-    """
-    values = np.where(match.outliers, np.nan, match.values)
-    gains = np.abs(gains_of(match.responses[..., match.drives], values))
-    sizes = np.log(np.where(gains > 0, gains, np.nan))
-    driven = np.flatnonzero(np.isfinite(sizes).any(axis=0)).tolist()
-    if len(driven) < _MIN_CHANNELS:
-        return set()
-    sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
-    glued = set()
-    for number in driven:
-        rivals = [rival for rival in driven if rival != number]
-        size = sizes[:, number] - np.nanmedian(sizes[:, rivals], axis=1)
-        exciter = match.rig.eras[match.drives[number]]
-        if isinstance(exciter, Exciter) and _rises_like_glue(size, exciter, match.plate.omega):
-            glued.add(number)
-    return glued
-
-
-def _rises_like_glue(size: FloatArray, exciter: Exciter, omega: FloatArray) -> bool:
-    """Whether a spring of glue explains the logarithms of an exciter's gains (f,) clearly."""
-    stiffness = exciter.dynamic_stiffness(omega)
-    transmitted = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
-    residuals = np.vstack([size, size - transmitted])
-    residuals -= np.nanmedian(residuals, axis=1, keepdims=True)
-    without_glue, *with_glue = np.nanmedian(np.abs(residuals), axis=1).tolist()
-    best = int(np.argmin(with_glue))
-    rise = np.ptp(transmitted[best][np.isfinite(size)])
-    return bool(with_glue[best] < _EXPLAINS * without_glue and rise > _RISES)
-
-
 def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
     """Return relative differences of the most probable plate from a rig's, by kind of value.
 
@@ -564,48 +468,3 @@ def check_meaning(rig: Rig, measurement: Measurement) -> None:
     if misread:
         finding, _, _ = misread
         raise InputError(finding.rule)
-
-
-def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
-    """Raise InputError if the gains of all channels indicate another quantity or unit."""
-    model = plate.responses(plate.start(*shapes.start))[..., shapes.nearest]
-    gains = gains_of(model, values)
-    sizes = np.log(row_rms(values) / row_rms(model))[:, 0]
-    is_driven = np.isfinite(gains)
-    omega = plate.omega[:, None]
-
-    def distance(quantity: _Quantity) -> float:
-        """Return the distance of gains from the gains of a quantity, in size and phase."""
-        expected = quantity.factor * (1j * omega) ** quantity.power
-        size_error = np.abs(sizes - np.log(np.abs(expected)))[is_driven]
-        phase_error = np.angle(gains / expected)[is_driven]
-        return float(np.median(size_error) + 1 - np.median(np.cos(phase_error)))
-
-    level = float(np.median(sizes[is_driven]))
-    nearest = best_by(_WRONG_QUANTITIES, lambda quantity: -distance(quantity))
-    gap = distance(nearest)
-    if abs(level) < np.log(_MAX_GAIN) or distance(_RIGHT_QUANTITY) < gap:
-        return
-    ratio = f"{np.exp(level):.3g} times the prediction"
-    if gap < np.log(_MAX_GAIN):
-        raise InputError(
-            "responses must be acceleration per base displacement in 1/s²; values appear to be in "
-            f"{nearest.name}: all are {ratio}; {nearest.remedy}"
-        )
-    raise InputError(
-        f"responses must match the rig within a factor of {_MAX_GAIN:g}, got {ratio}; check their "
-        "unit and the stroke of the ERAs"
-    )
-
-
-def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
-    """Raise InputError for conjugated phases."""
-    match = best_wiring(plate, values, shapes)
-    conjugate = best_wiring(plate, values.conj(), shapes)
-    if conjugate.fit.cost < match.fit.cost - MIN_COST_REDUCTION:
-        raise InputError(
-            "phases must be for exp(+i omega t), but appear to be conjugated: with the signs of "
-            "all imaginary parts changed, the model fits better "
-            f"({100 * conjugate.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
-            "change the signs"
-        )

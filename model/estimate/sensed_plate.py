@@ -183,13 +183,13 @@ class SensedPlate(ForwardModel):
     @cached_property
     def numbers(self) -> IntArray:
         """Index of each fitted value in the space (n,)."""
-        eras = ["", *(era.name for era in self.rig.eras)]
-        feet = ["", *self.rig.foot_names]
+        eras = {era.name: number for number, era in enumerate(self.rig.eras)}
+        feet = {name: number for number, name in enumerate(self.rig.foot_names)}
         numbers = []
         for parameter in self.parameters:
             kind = _ADDED_KINDS.get(parameter.kind, parameter.kind)
-            offset = eras.index(parameter.era) + feet.index(parameter.foot) - 1
-            numbers.append(self.space.groups[kind].start + max(offset, 0))
+            offset = eras.get(parameter.era, 0) + feet.get(parameter.foot, 0)
+            numbers.append(self.space.groups[kind].start + offset)
         return np.array(numbers)
 
     def with_rig(self, rig: Rig) -> "SensedPlate":

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray, best_of
 from model.errors import InputError
 from model.estimate.calibration_result import MAX_PREDICTION_ERROR, Calibration
-from model.estimate.fit import JointPrior
+from model.estimate.fit import Fit, JointPrior
 from model.estimate.gains import are_impossible
 from model.estimate.loss_law import viscous_difference
 from model.estimate.measurement import Measurement, check_enough_sensors
@@ -92,19 +92,25 @@ def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) ->
     measurement = replace(measurement, errors=std)
     start[space.groups["sensor_scale"]] = (scales - 1) / PARAMETER_KINDS["sensor_scale"].std
     prior = _prior(plate, start, np.ones(len(scales), dtype=bool))
-    searched = space.uncertain & ~space.of("gain")
-    for _ in range(_LAW_ROUNDS):
-        change = viscous_difference(replace(plate, viscous_change=None), start)
-        plate = replace(plate, viscous_change=change)
-        result = fit_to_noise(plate, measurement, searched=searched, start=start, prior=prior)
-        measurement = result.measurement
-        start = result.x
     return Calibration(
-        fit=result,
+        fit=_fitted_with_loss_law(plate, measurement, prior, start),
         prior=prior,
         dead_sensors=tuple(compress(measured.names, dead)),
         dead_eras=tuple(compress((era.name for era in rig.eras), screened.dead_eras)),
     )
+
+
+def _fitted_with_loss_law(
+    plate: SensedPlate, measurement: Measurement, prior: JointPrior, start: FloatArray
+) -> Fit[SensedPlate]:
+    """Fit with the effect of viscous losses at the start (p,), then again at the fitted values."""
+    searched = plate.space.uncertain & ~plate.space.of("gain")
+    for _ in range(_LAW_ROUNDS):
+        plate = replace(plate, viscous_change=viscous_difference(plate, start))
+        result = fit_to_noise(plate, measurement, searched=searched, start=start, prior=prior)
+        measurement = result.measurement
+        start = result.x
+    return result
 
 
 def _with_known_scales(calibration: Calibration, *, all_scales: bool) -> Calibration:

@@ -137,8 +137,10 @@ class Fit(Generic[ModelT]):
     ) -> list[tuple[int, float]]:
         """Find the points (m, 2) [m] where a single load explains most: index and size, best first.
 
-        factor (f,): effect of a load of size 1 relative to 1 kg, default 1; std: prior standard
-        error of the size, which must be positive to count.
+        A load of size s changes the residuals r by b s. Together with the searched parameters,
+        whose derivatives are J, it minimizes |r + J dx + b s|² and the priors. factor (f,): effect
+        of a load of size 1 relative to 1 kg, default 1; std: prior standard error of the size,
+        which must be positive to count.
         """
         load_slopes = ResponseDerivatives(self.fitted_plate).mass_at(points)
         if factor is not None:
@@ -149,15 +151,15 @@ class Fit(Generic[ModelT]):
         by_size = std * np.vstack([columns.real, columns.imag])
         r, J = self.of_values
         J = np.asfortranarray(J)  # all products below are of columns
-        whole = np.asfortranarray(self.slopes)
-        information = linalg.cho_factor(whole.T @ whole)
-        # What the searched parameters cannot explain if they are fitted together with the load.
-        unexplained = r - J @ linalg.cho_solve(information, whole.T @ self.residuals)
+        slopes = np.asfortranarray(self.slopes)
+        information = linalg.cho_factor(slopes.T @ slopes)
+        # Parts of r and b that the searched parameters cannot explain.
+        unexplained = r - J @ linalg.cho_solve(information, slopes.T @ self.residuals)
         effect = by_size - J @ linalg.cho_solve(information, J.T @ by_size)
-        downhill = -(unexplained @ by_size)
-        sizes = downhill / ((by_size * effect).sum(axis=0) + 1)
-        explained = np.where(sizes > 0, sizes * downhill, 0.0)
-        return [(int(n), std * float(sizes[n])) for n in best_first(explained) if explained[n] > 0]
+        gradient = -(unexplained @ by_size)
+        sizes = gradient / ((by_size * effect).sum(axis=0) + 1)
+        reduction = np.where(sizes > 0, sizes * gradient, 0.0)
+        return [(int(n), std * float(sizes[n])) for n in best_first(reduction) if reduction[n] > 0]
 
 
 def likeliest_fit(fits: Sequence[Fit[ModelT]]) -> Fit[ModelT]:

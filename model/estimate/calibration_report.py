@@ -145,7 +145,7 @@ def calibration_json(calibration: Calibration, original: Rig) -> dict[str, Any]:
         "values": calibration.value_count,
         "outliers": calibration.outlier_count,
         "fit_error": calibration.error,
-        "chi2": calibration.fit.chi2,
+        "chi2": calibration.chi2,
         "held_out": _held_out_json(calibration.held_out),
         "good": calibration.is_good,
         "fingerprint_before": original.fingerprint,

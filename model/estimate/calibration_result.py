@@ -102,25 +102,16 @@ class Calibration:
                     measured.append((frequency, abs(gain), float(np.angle(gain))))
             eras.append(replace(era, gains=tuple(measured) or era.gains))
         unexplained = self.held_out.unexplained if self.held_out else 0.0
-        uncertainty = self.uncertainty.of_rig(unexplained)
+        uncertainty = self._uncertainty.of_rig(unexplained)
         return replace(self._fitted, eras=tuple(eras), uncertainty=uncertainty)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Fitted values, with errors from the fit, the model and the total mass."""
-        return self.uncertainty.parameters
+        """Fitted values, with errors from the fit, the model and the total mass.
 
-    @cached_property
-    def uncertainty(self) -> CalibrationUncertainty:
-        """Errors of the fitted values, gains and fields."""
-        return CalibrationUncertainty(self.fit, self._plain)
-
-    @cached_property
-    def gains_error(self) -> FloatArray:
-        """Standard errors of the rig's gains (f, eras), NaN where not measured."""
-        size = np.abs(self.gains_of_fit)
-        fit_error = size * self.uncertainty.relative_gain_errors
-        return np.asarray(np.hypot(fit_error, np.abs(self._gains) - size))
+        All fitted values except losses scale with the total mass, which responses cannot determine.
+        """
+        return self._uncertainty.parameters
 
     @property
     def moved(self) -> dict[str, tuple[Point, Point]]:
@@ -134,6 +125,13 @@ class Calibration:
                 x_error, y_error = errors[number]
                 moved[era.name] = ((era.x, era.y), (x_error, y_error))
         return moved
+
+    @cached_property
+    def gains_error(self) -> FloatArray:
+        """Standard errors of the rig's gains (f, eras), NaN where not measured."""
+        size = np.abs(self.gains_of_fit)
+        fit_error = size * self._uncertainty.relative_gain_errors
+        return np.asarray(np.hypot(fit_error, np.abs(self._gains) - size))
 
     @property
     def scales(self) -> dict[str, tuple[float, float]]:
@@ -160,6 +158,11 @@ class Calibration:
     def error(self) -> float:
         """Relative error of the fit with form errors; see `HeldOutSensors`."""
         return self._relative_error(self.fit.predicted, self.measurement.known)
+
+    @property
+    def chi2(self) -> float:
+        """chi² per degree of freedom; about 1 for a good fit."""
+        return self.fit.chi2
 
     @property
     def measurement(self) -> Measurement:
@@ -300,6 +303,11 @@ class Calibration:
         x[form_errors | (space.of("place") & ~is_clear(self.fit))] = 0.0
         searched = self.fit.searched & refitted
         return fit(self.plate, self.measurement, searched=searched, start=x, prior=self.prior)
+
+    @cached_property
+    def _uncertainty(self) -> CalibrationUncertainty:
+        """Errors of the fitted values, gains and fields."""
+        return CalibrationUncertainty(self.fit, self._plain)
 
     @cached_property
     def _fitted(self) -> Rig:

@@ -2,7 +2,7 @@
 
 Errors have three sources: the fit to noisy values, plate theory, and form errors, which the fit
 determines but a rig file cannot express. The rig is therefore fitted a second time without form
-errors; what it then misses of the fitted fields is the `field` of its uncertainty.
+errors. The difference of the fields of both fits is the `field` of its uncertainty.
 """
 
 import math

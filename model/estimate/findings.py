@@ -11,13 +11,13 @@ verdict, and call it in `with_findings`.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
 from scipy.special import chdtrc
 
-from model.arrays import FloatArray, best_by, best_of, rms
+from model.arrays import FloatArray, Point, best_by, best_of, rms
 from model.estimate.hypotheses import Hypothesis
 from model.estimate.load_search import Load, match_with_form
 from model.estimate.plate_match import FALSE_ALARM, MAX_FIT_ERROR, Match
@@ -33,7 +33,7 @@ _NEARLY_ALL = 0.75  # of the channels
 _MIN_SHARE = 0.05  # likelihood of a reported hypothesis
 _DETACHED = 0.1  # of the stiffness of an ERA
 _HEAVY = 0.02  # of the plate's mass, all masses together: twice the tolerance of foreign mass
-_MIN_SHOWN = 1e-6  # of a variance
+_MIN_VARIANCE = 1e-6  # of a slope
 _THICKNESS = "thickness"
 _FORM = {
     "place": "places of ERAs",
@@ -537,38 +537,53 @@ def _load_finding(load: Load, error: float) -> Finding:
     return Finding("finger", "plate", details=details, json=json)
 
 
+class _FormTest(NamedTuple):
+    """Test of a kind of form errors against their tolerance."""
+
+    name: str
+    size: float
+    """RMS of the errors in standard deviations."""
+    chance: float
+    """Share of correct plates with errors at least as large, or an upper bound of it."""
+
+
 def _form_finding(match: Match) -> Finding | None:
     """Return the form error that is least likely on correct plates, or the unexplained response,
     None if both are within tolerances."""
-    chances = {}
-    sizes = {}
+    slope, taper = _along_plate(match)
+    tests = []
     for kind, name in _FORM.items():
         z = match.fit.x[match.fit.space.of(kind)]
-        chances[name] = len(_FORM) * float(chdtrc(len(z), z @ z))
-        sizes[name] = rms(z)
-    slope, (x, y) = _along_plate(match)
-    chances[_THICKNESS] = float(chdtrc(len(slope), slope @ slope))
-    sizes[_THICKNESS] = rms(slope)
-    farthest = best_by([*chances], lambda name: -chances[name])
-    chance = chances[farthest]
-    json: dict[str, Any] = {"unexplained": match.error}
-    if chance >= FALSE_ALARM:
-        if match.error <= MAX_FORM_ERROR:
-            return None
-        details = {"difference": f"{percent(match.error)} of the response is unexplained"}
-        return Finding("unnamed", "response", match.error, details=details, json=json)
-    size = sizes[farthest]
-    json |= {"farthest": farthest, "standard_deviations": size}
-    if farthest == _THICKNESS:
+        tests.append(_FormTest(name, rms(z), len(_FORM) * float(chdtrc(len(z), z @ z))))
+    tests.append(_FormTest(_THICKNESS, rms(slope), float(chdtrc(len(slope), slope @ slope))))
+    farthest = best_by(tests, lambda test: -test.chance)
+    if farthest.chance < FALSE_ALARM:
+        return _form_error_finding(farthest, taper, match.error)
+    if match.error <= MAX_FORM_ERROR:
+        return None
+    details = {"difference": f"{percent(match.error)} of the response is unexplained"}
+    json = {"unexplained": match.error}
+    return Finding("unnamed", "response", match.error, details=details, json=json)
+
+
+def _form_error_finding(test: _FormTest, taper: Point, error: float) -> Finding:
+    """Return the finding of a form error beyond its tolerance.
+
+    taper: relative, at the ends of x and of y; error: unexplained share of the responses.
+    """
+    _, size, chance = test
+    json = {"unexplained": error, "farthest": test.name, "standard_deviations": size}
+    if test.name == _THICKNESS:
+        x, y = taper
         details = {"along_x": f"{100 * x:+.1f} %", "along_y": f"{100 * y:+.1f} %"}
         json |= {"thicker_at_end_of_x": x, "thicker_at_end_of_y": y}
         return Finding("thickness", "ends", size, chance=chance, details=details, json=json)
-    difference = f"{farthest} are off by {size:.1f} standard deviations of their tolerance"
+    difference = f"{test.name} are off by {size:.1f} standard deviations of their tolerance"
     details = {"difference": difference}
-    return Finding("unnamed", farthest, size, chance=chance, details=details, json=json)
+    return Finding("unnamed", test.name, size, chance=chance, details=details, json=json)
 
 
-def _along_plate(match: Match) -> tuple[FloatArray, tuple[float, float]]:
+def _along_plate(match: Match) -> tuple[FloatArray, Point]:
     """Return the slope of sensor scales along both sides (2,), and the taper that explains it.
 
     A plate moves more at a thinner end. The slope is relative to its standard error, the taper is
@@ -580,10 +595,11 @@ def _along_plate(match: Match) -> tuple[FloatArray, tuple[float, float]]:
     points = match.fit.measurement.points
     along = 2 * points / match.plate.sides - 1
     basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
-    shown = np.eye(len(points)) - match.linearized().stated_covariance[part, part]
-    shown = basis.T @ shown @ basis + _MIN_SHOWN * np.eye(2)
+    # Covariance of fitted scales on plates within tolerances, then of their slopes.
+    scale_covariance = np.eye(len(points)) - match.linearized().stated_covariance[part, part]
+    covariance = basis.T @ scale_covariance @ basis + _MIN_VARIANCE * np.eye(2)
     slope = basis.T @ match.fit.x[part]
-    thinner = basis @ linalg.solve(shown, slope) * space.std[part]
+    thinner = basis @ linalg.solve(covariance, slope) * space.std[part]
     taper = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
-    root = linalg.cholesky(shown, lower=True)
+    root = linalg.cholesky(covariance, lower=True)
     return linalg.solve(root, slope), (float(taper[0]), float(taper[1]))

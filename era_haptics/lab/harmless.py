@@ -77,27 +77,25 @@ class Names:
 
     def declared(self, name: str) -> str:
         """Return the replacement of a name declared by a mapping; public names stay."""
-        if name in public_words() or not _IDENTIFIER.fullmatch(name):
-            return name if name in public_words() else HIDDEN
+        if name in public_words():
+            return name
+        if not _IDENTIFIER.fullmatch(name):
+            return HIDDEN
         return self._replacements.setdefault(name, f"name-{len(self._replacements) + 1}")
 
-    def known(self, name: str) -> str | None:
+    def replacement_of(self, name: str) -> str | None:
         """Return the replacement of a declared name; None for other text."""
         return self._replacements.get(name)
 
 
 def harmless_configuration(document: Document, names: Names) -> str:
-    """Return the harmless text of a rig, daemon or layout file; names: shared by all files."""
-    schema, definitions = _schema_of(document)
-    reader = _Configuration(document, definitions, names)
-    reader.declare(document.data, schema)
-    return data_text(reader.mapping((), document.data, schema))
+    """Return the harmless text of a rig, daemon or layout file; names: shared by all files.
 
-
-def declare_names(document: Document, names: Names) -> None:
-    """Collect the names that a file declares, before any file that may refer to them is shown."""
+    Names that the file declares below a reference to them are known only at a second call.
+    """
     schema, definitions = _schema_of(document)
-    _Configuration(document, definitions, names).declare(document.data, schema)
+    configuration = _Configuration(document, definitions, names)
+    return data_text(configuration.mapping((), document.data, schema))
 
 
 class _Configuration:
@@ -108,23 +106,6 @@ class _Configuration:
         self._definitions = definitions
         self._names = names
 
-    def declare(self, value: Value, schema: Schema) -> None:
-        """Collect the names that mappings of user-defined names declare."""
-        if isinstance(value, list):
-            items = self._of_kind(schema, "array")
-            for number, entry in enumerate(value):
-                self.declare(entry, _item_schema(items, number))
-        if not isinstance(value, dict):
-            return
-        best = self._mapping_schema(value, schema)
-        for key, entry in value.items():
-            inner = best.get("properties", {}).get(key)
-            if inner is None and isinstance(best.get("additionalProperties"), dict):
-                inner = best["additionalProperties"]
-                self._names.declared(key)
-            if inner is not None:
-                self.declare(entry, inner)
-
     def mapping(
         self, path: tuple[str | int, ...], value: Mapping[str, Value], schema: Schema
     ) -> dict[str, Value]:
@@ -132,31 +113,37 @@ class _Configuration:
         best = self._mapping_schema(value, schema)
         properties = best.get("properties", {})
         further = best.get("additionalProperties")
-        shown: dict[str, Value] = {}
+        reduced: dict[str, Value] = {}
         unknown: list[str] = []
         for key, entry in value.items():
-            inner = (*path, key)
-            if key in properties:
-                shown[key] = self._shown(inner, entry, properties[key])
-            elif isinstance(further, dict) and (name := self._names.declared(key)) != HIDDEN:
-                shown[name] = self._shown(inner, entry, further)
-            else:
+            name = key
+            entry_schema = properties.get(key)
+            if entry_schema is None and isinstance(further, dict):
+                name = self._names.declared(key)
+                entry_schema = further
+            if entry_schema is None or name == HIDDEN:
                 unknown.append(key)
+            else:
+                reduced[name] = self._reduced((*path, key), entry, entry_schema)
         if unknown:
-            shown[HIDDEN] = self._described(path, unknown, [*properties])
-        return shown
+            reduced[HIDDEN] = self._described(path, unknown, [*properties])
+        return reduced
 
     def _described(
-        self, path: tuple[str | int, ...], unknown: Sequence[str], known: Sequence[str]
+        self, path: tuple[str | int, ...], unknown: Sequence[str], known_keys: Sequence[str]
     ) -> str:
         """Describe unknown keys without quoting them: their lines and similar known keys."""
-        lines = [self._document.line_of((*path, key)) for key in unknown]
-        places = ", ".join(f"line {line}" for line in lines if line)
-        meant = sorted({word for key in unknown for word in get_close_matches(key[:40], known, 1)})
-        similar = f"; similar to {', '.join(meant)}" if meant else ""
-        return f"unknown keys at {places or 'no line'}{similar}"
+        places = []
+        similar_keys: set[str] = set()
+        for key in unknown:
+            line = self._document.line_of((*path, key))
+            if line:
+                places.append(f"line {line}")
+            similar_keys.update(get_close_matches(key[:40], known_keys, 1))
+        similar = f"; similar to {', '.join(sorted(similar_keys))}" if similar_keys else ""
+        return f"unknown keys at {', '.join(places) or 'no line'}{similar}"
 
-    def _shown(self, path: tuple[str | int, ...], value: Value, schema: Schema) -> Value:
+    def _reduced(self, path: tuple[str | int, ...], value: Value, schema: Schema) -> Value:
         if value is None or isinstance(value, bool):
             return value
         if isinstance(value, dict):
@@ -164,7 +151,7 @@ class _Configuration:
         if isinstance(value, list):
             items = self._of_kind(schema, "array")
             return [
-                self._shown((*path, number), entry, _item_schema(items, number))
+                self._reduced((*path, number), entry, _item_schema(items, number))
                 for number, entry in enumerate(value)
             ]
         choices = [*self._alternatives(schema)]
@@ -183,7 +170,7 @@ class _Configuration:
             place = os.path.realpath(self._document.beside(text))
             if place in self._names.files:
                 return self._names.files[place]
-        return public_text(text, self._names) or self._names.known(text) or HIDDEN
+        return public_text(text, self._names) or self._names.replacement_of(text) or HIDDEN
 
     def _mapping_schema(self, value: Mapping[str, Value], schema: Schema) -> Schema:
         """Return the alternative that fits a mapping best: first by kind, then by known keys."""
@@ -204,13 +191,12 @@ class _Configuration:
             name = schema["$ref"].rpartition("/")[2]
             yield from self._alternatives(self._definitions[name])
             return
-        parts = (
-            [] if "properties" in schema else [*schema.get("anyOf", ()), *schema.get("oneOf", ())]
-        )
-        if not parts:
+        choices = [*schema.get("anyOf", ()), *schema.get("oneOf", ())]
+        if "properties" in schema or not choices:
             yield schema
-        for part in parts:
-            yield from self._alternatives(part)
+            return
+        for choice in choices:
+            yield from self._alternatives(choice)
 
 
 def _types_of(schema: Schema) -> set[str]:
@@ -245,43 +231,50 @@ def _schemas() -> tuple[dict[str, Schema], Schema]:
     sections: list[type[BaseModel]] = [RigSection, DaemonSection, LayoutSection, *EFFECTS]
     by_model, whole = models_json_schema([(section, "validation") for section in sections])
     definitions = whole["$defs"]
-    rig, daemon, layout, *effects = (
-        dict(definitions[by_model[section, "validation"]["$ref"].rpartition("/")[2]])
-        for section in sections
-    )
-    # A fitted rig has standard errors; effects are stored under user-defined names, with a kind.
-    errors = {"type": "object", "additionalProperties": {"type": "number"}}
-    beside = {"base": {"type": "string"}, "base_fingerprint": {"type": "string"}}
-    rig["properties"] = rig["properties"] | beside | {"standard_errors": errors}
-    kinds = [
-        effect | {"properties": effect["properties"] | {"kind": {"const": section.kind}}}
-        for section, effect in zip(EFFECTS, effects, strict=True)
-    ]
-    of_users = {"type": "object", "additionalProperties": {"anyOf": kinds}}
-    layout["properties"] = layout["properties"] | {"effects": of_users}
+    schemas = []
+    for section in sections:
+        reference = by_model[section, "validation"]["$ref"]
+        schemas.append(dict(definitions[reference.rpartition("/")[2]]))
+    rig, daemon, layout, *effects = schemas
+    # A fitted rig has its base and standard errors.
+    fitted = {
+        "base": {"type": "string"},
+        "base_fingerprint": {"type": "string"},
+        "standard_errors": {"type": "object", "additionalProperties": {"type": "number"}},
+    }
+    rig["properties"] = rig["properties"] | fitted
+    # Effects are stored under user-defined names, with a kind.
+    for section, effect in zip(EFFECTS, effects, strict=True):
+        effect["properties"] = effect["properties"] | {"kind": {"const": section.kind}}
+    named_effects = {"type": "object", "additionalProperties": {"anyOf": effects}}
+    layout["properties"] = layout["properties"] | {"effects": named_effects}
     return {"rig": rig, "daemon": daemon, "layout": layout}, definitions
 
 
 @cache
 def public_words() -> frozenset[str]:
     """Return the public words of this program: choices, and names in its own example."""
+    words = {POLYNOMIALS, "auto", *named_contents()}
+    words.update(effect.kind for effect in EFFECTS)
+    for choices in (KNOWN_MATERIALS, EXCITER_TYPES, THRESHOLDS, DRIVE_MODES, ELEMENTS):
+        words.update(choices)
     example = read_document(example_rig_path()).data
-    names = [name for key in ("eras", "amplifiers") for name in _keys_of(example[key])]
-    kinds = [effect.kind for effect in EFFECTS]
-    public = [*KNOWN_MATERIALS, *EXCITER_TYPES, *THRESHOLDS, *DRIVE_MODES, *ELEMENTS]
-    return frozenset([*names, *kinds, *named_contents(), *public, POLYNOMIALS, "auto"])
-
-
-def _keys_of(value: Value) -> list[str]:
-    return [*value] if isinstance(value, dict) else []
+    for key in ("eras", "amplifiers"):
+        declared = example[key]
+        if isinstance(declared, dict):
+            words.update(declared)
+    return frozenset(words)
 
 
 @cache
 def _public_units() -> frozenset[str]:
     """Return the units in this program's messages."""
-    dimensions = [each for each in vars(units).values() if isinstance(each, units.Dimension)]
-    examples = [dimension.example.partition(" ")[2] for dimension in dimensions]
-    return frozenset([*(unit for each in dimensions for unit in each.factors), *examples, ""])
+    public_units = {""}
+    for dimension in vars(units).values():
+        if isinstance(dimension, units.Dimension):
+            public_units.update(dimension.factors)
+            public_units.add(dimension.example.partition(" ")[2])
+    return frozenset(public_units)
 
 
 def is_quantity(text: str) -> bool:
@@ -301,8 +294,10 @@ def public_text(text: str, names: Names) -> str:
     scheme = text.partition(":")[0].lower()
     if scheme in (*schemes(), *source_schemes()):
         return _public_url(scheme, text.partition(":")[2], names)
-    ending = next((each for each in _FILE_ENDINGS if text.lower().endswith(each)), "")
-    return f"{HIDDEN}{ending}" if ending else ""
+    for ending in _FILE_ENDINGS:
+        if text.lower().endswith(ending):
+            return f"{HIDDEN}{ending}"
+    return ""
 
 
 def _public_url(scheme: str, rest: str, names: Names) -> str:
@@ -312,22 +307,23 @@ def _public_url(scheme: str, rest: str, names: Names) -> str:
     options, _, number = options.partition("#")
     if not options:
         place, _, number = place.partition("#")
-    shown = place if place in ("", "/") or _DEVICE.fullmatch(place) else HIDDEN
+    is_public = place in ("", "/") or _DEVICE.fullmatch(place) is not None
+    url = f"{scheme}:{slashes}{place if is_public else HIDDEN}"
+    read_url = address_of if scheme in schemes() else open_source
     try:
-        (address_of if scheme in schemes() else open_source)(f"{scheme}:{rest}")
+        read_url(f"{scheme}:{rest}")
     except (CommandError, InputError):
-        return f"{scheme}:{slashes}{shown}"
-    pairs = [
-        f"{name}={_public_option(value, names)}"
-        for name, value in parse_qsl(options, keep_blank_values=True)
-    ]
-    query = f"?{'&'.join(pairs)}" if pairs else ""
-    return f"{scheme}:{slashes}{shown}{query}{f'#{number}' if _SHORT.fullmatch(number) else ''}"
+        return url
+    separator = "?"
+    for name, value in parse_qsl(options, keep_blank_values=True):
+        url += f"{separator}{name}={_public_option(value, names)}"
+        separator = "&"
+    return f"{url}#{number}" if _SHORT.fullmatch(number) else url
 
 
 def _public_option(value: str, names: Names) -> str:
     is_public = value in CLOCK_ERRORS or _OPTION.fullmatch(value) is not None
-    return value if is_public else names.known(value) or HIDDEN
+    return value if is_public else names.replacement_of(value) or HIDDEN
 
 
 def harmless_records(text: str, names: Names) -> str:
@@ -355,28 +351,29 @@ def _recorded(value: Any, names: Names) -> Any:
         return harmless_words(value, names)
     if not isinstance(value, dict):
         return value
-    shown: dict[str, Any] = {}
+    reduced: dict[str, Any] = {}
     for key, entry in value.items():
-        is_own = key in own_words() or key in public_words()
-        name = key if is_own else names.known(key) or f"{HIDDEN}-{len(shown) + 1}"
+        name = names.replacement_of(key) or f"{HIDDEN}-{len(reduced) + 1}"
+        if key in own_words() or key in public_words():
+            name = key
         is_secret = _SECRET.search(key) is not None
         is_nested = isinstance(entry, dict | list | bool | None)
         if name.startswith(HIDDEN) or (is_secret and not is_nested):
-            shown[name] = HIDDEN
+            reduced[name] = HIDDEN
         elif key == "traceback" and isinstance(entry, str):
-            shown[name] = _harmless_traceback(entry, names)
+            reduced[name] = _harmless_traceback(entry, names)
         else:
-            shown[name] = _recorded(entry, names)
-    return shown
+            reduced[name] = _recorded(entry, names)
+    return reduced
 
 
 def harmless_words(text: str, names: Names) -> str:
     """Replace everything by an ellipsis except numbers, the program's own words and known names."""
 
-    def shown(found: re.Match[str]) -> str:
-        token = found[0]
+    def replaced(match: re.Match[str]) -> str:
+        token = match[0]
         core = token.strip(".,;:()[]'\"")
-        name = names.known(core)
+        name = names.replacement_of(core)
         if name is not None:
             return token.replace(core, name)
         if not any(sign.isalnum() for sign in core) or _is_own(core):
@@ -386,7 +383,7 @@ def harmless_words(text: str, names: Names) -> str:
             return token.replace(core, _public_url(scheme, rest, names))
         return "…"
 
-    return re.sub(r"\S+", shown, text)
+    return re.sub(r"\S+", replaced, text)
 
 
 def _is_own(core: str) -> bool:
@@ -395,10 +392,10 @@ def _is_own(core: str) -> bool:
     name, equals, value = core.partition("=")
     if equals:
         return name in own_words() and not _SECRET.search(name) and is_quantity(value)
+    if core in _own_modules():
+        return True
     parts = re.split(r"[-_/]", core)
-    return core in _own_modules() or all(
-        _WORD.fullmatch(part) and part in own_words() for part in parts
-    )
+    return all(_WORD.fullmatch(part) and part in own_words() for part in parts)
 
 
 def _harmless_traceback(text: str, names: Names) -> str:
@@ -409,8 +406,9 @@ def _harmless_traceback(text: str, names: Names) -> str:
         if frame is None:
             lines.append(harmless_words(line, names))
             continue
-        own = next((file for file in _own_files() if frame[1].endswith(f"/{file}")), HIDDEN)
-        lines.append(f"  File {own}, line {frame[2]}")
+        path, line_number = frame.groups()
+        file = next((file for file in _own_files() if path.endswith(f"/{file}")), HIDDEN)
+        lines.append(f"  File {file}, line {line_number}")
     return "\n".join(lines)
 
 

@@ -23,7 +23,6 @@ from controller.effects.layout import is_layout_document
 from drivers.errors import LinkError
 from era_haptics.lab.harmless import (
     Names,
-    declare_names,
     harmless_configuration,
     harmless_json,
     harmless_records,
@@ -73,7 +72,7 @@ class _Report:
         except ConfigError as error:
             self._add_unreadable(path, [problem.line for problem in error.problems])
             return
-        declare_names(document, self.names)
+        harmless_configuration(document, self.names)  # declares its names
         name = self._new_name(_kind_of(document), ".yaml")
         self._documents.append((name, path, document))
         self._add(name, "", path)

@@ -23,13 +23,13 @@ at a multiple of the level, since they share the stroke.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_rows
-from model.ensemble.attached_plate import mounts_of
+from model.ensemble.attached_plate import Mounts, mounts_of
 from model.ensemble.expected_power import expected_power, power_of
 from model.finger import FIVE_POINTS, STRONG_DB_SL, Grid, detection_threshold, fingertips_on
 from model.reduction.free_plate import solve_free_plate
@@ -63,28 +63,6 @@ class PlaceReceptances:
     between: Complex64Array
     to_tips: Complex64Array
     to_plate: Complex64Array
-
-
-class _MountedEras(NamedTuple):
-    """n ERAs at f frequencies; see `model.ensemble.attached_plate.Mounts`."""
-
-    minus_omega2: Float32Array
-    """-w² (f, 1, 1) [rad²/s²]."""
-    stiffness: Complex64Array
-    """Z (f, n) [N/m]."""
-    strokes: Complex64Array
-    """(f, n) [m]."""
-    by_stiffness: Complex64Array
-    """(f, n) [N/m]."""
-    by_damping: Complex64Array
-    """(f, n) [N/m]."""
-    forces: Complex64Array
-    """(f, n) [N]."""
-
-    @property
-    def acceleration_per_transfer(self) -> Complex64Array:
-        """Acceleration [m/s²] at full stroke per unit of receptance, (f, 1, n)."""
-        return np.asarray(self.minus_omega2 * self.forces[:, None])
 
 
 class _TouchedPlates(NamedTuple):
@@ -125,6 +103,7 @@ class Scorer:
         self._contents = contents
         self._thicknesses = _thicknesses_of(rig.uncertainty)
         self._mounts = mounts_of(eras, (), omega, rig.uncertainty)
+        self._minus_omega2 = self._mounts.minus_omega2[:, None, None]
         self._finger_stiffness = _finger_stiffness(rig, omega)
         self._required = _required_levels(rig, frequencies, contents)
         self._free = solve_free_plate(plate, rig.mesh, frequency_max=float(frequencies.max()))
@@ -145,7 +124,8 @@ class Scorer:
         to_tips = self._solved(centers).to_tips
         by_tip = to_tips.reshape(*to_tips.shape[:2], *self._weights.shape, -1)
         tips = np.arange(len(centers))
-        return np.moveaxis(by_tip[:, :, tips, :, tips], 0, 2)
+        own = by_tip[:, :, tips, :, tips]
+        return np.moveaxis(own, 0, 2)
 
     def places(self, at: FloatArray) -> PlaceReceptances:
         """Solve for ERAs at positions [m] (c, 2): kept ones at their own, else the last."""
@@ -198,35 +178,38 @@ class Scorer:
     ) -> tuple[Complex64Array, Complex64Array]:
         """Return mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n,
         n)."""
-        uncertainty = self._rig.uncertainty
         eras = self._mounted(len(chosen))
         between = places.between[:, :, chosen[:, None], chosen]
         identity = np.eye(len(chosen), dtype=np.complex64)
         coupling = coupled_forces(between, eras.stiffness, identity)  # K
         plates = self._touched(places.to_tips[:, :, :, chosen], eras, coupling)
-        fields = plates.transfer * eras.acceleration_per_transfer[:, None]
+        fields = plates.transfer * self._acceleration_per_transfer(eras)[:, None]
         nominal = fields[0]
-        motion = -(between[0] @ (coupling[0] * eras.forces[:, None]))  # r_e
-        motion.reshape(len(motion), -1)[:, :: len(chosen) + 1] += eras.strokes
-        by_damping = _field_by_damping(plates.transfer[0], eras, motion)
+        held_forces = coupling[0] * eras.forces[:, None]
+        motion = -(between[0] @ held_forces)  # r_e
+        diagonals = motion.reshape(len(motion), -1)[:, :: len(chosen) + 1]
+        diagonals += eras.strokes
+        by_damping = self._field_by_damping(plates.transfer[0], eras, motion)
         by_thickness = (fields[1:] - nominal) * np.float32(math.sqrt(0.5))
+        independent = self._independent_errors(plates, eras, motion)
+        error_power = self._field_error(places, chosen, eras, coupling[0])
         power = expected_power(
             [nominal, by_damping, *by_thickness],
-            self._independent_errors(plates, eras, motion),
+            independent,
             self._weights,
-            gain_variance=uncertainty.gain_variance,
-            error_power=self._field_error(places, chosen, eras, coupling[0]),
+            gain_variance=self._rig.uncertainty.gain_variance,
+            error_power=error_power,
         )
         mean_field = (nominal * self._weights[..., None]).sum(axis=2)
         return mean_field, power
 
-    def _mounted(self, count: int) -> _MountedEras:
+    def _mounted(self, count: int) -> Mounts:
         """Return `count` ERAs; additional ones equal the last."""
         mounts = self._mounts
         last = mounts.stiffness.shape[1] - 1
         numbers = np.minimum(np.arange(count), last)
-        return _MountedEras(
-            minus_omega2=mounts.minus_omega2[:, None, None],
+        return replace(
+            mounts,
             stiffness=mounts.stiffness[:, numbers],
             strokes=mounts.strokes[:, numbers],
             by_stiffness=mounts.by_stiffness[:, numbers],
@@ -234,8 +217,12 @@ class Scorer:
             forces=mounts.forces[:, numbers],
         )
 
+    def _acceleration_per_transfer(self, eras: Mounts) -> Complex64Array:
+        """Acceleration [m/s²] at full stroke per unit of receptance, (f, 1, n)."""
+        return np.asarray(self._minus_omega2 * eras.forces[:, None])
+
     def _touched(
-        self, to_tips: Complex64Array, eras: _MountedEras, coupling: Complex64Array
+        self, to_tips: Complex64Array, eras: Mounts, coupling: Complex64Array
     ) -> _TouchedPlates:
         """Mount plates on ERAs and add each finger; to_tips (v, f, m p, n): of the free plates."""
         points = self._weights.shape[1]
@@ -247,32 +234,36 @@ class Scorer:
         held = to_centers[..., None, :] * unloaded
         own = self._own - held.sum(axis=-1)
         release = 1 / (1 + self._finger_stiffness * own[..., 0])
-        reaction = own * (self._finger_stiffness * release)[..., None]
+        finger_stiffness = self._finger_stiffness * release
+        reaction = own * finger_stiffness[..., None]
         transfer = unloaded - reaction[..., None] * at_centers[:, :, :, None]
         return _TouchedPlates(transfer, at_centers, own, release)
 
     def _independent_errors(
-        self, plates: _TouchedPlates, eras: _MountedEras, motion: Complex64Array
+        self, plates: _TouchedPlates, eras: Mounts, motion: Complex64Array
     ) -> Complex64Array:
         """Return the fields (f, m, j, n) of independent errors: each ERA's stiffness, and the
         finger's load."""
-        reach = np.sqrt(_mean_power(plates.transfer[0], self._weights)) * -eras.minus_omega2
-        by_stiffness = reach[..., None] * (eras.by_stiffness[:, :, None] * motion)[:, None]
+        transfer_size = np.sqrt(_mean_power(plates.transfer[0], self._weights))
+        reach = transfer_size * -self._minus_omega2
+        force = eras.by_stiffness[:, :, None] * motion
+        by_stiffness = reach[..., None] * force[:, None]
         load_std = self._rig.uncertainty.fingertip
         if load_std == 0:
             return np.asarray(by_stiffness)
         release = plates.release[0]
         own_size = np.sqrt(_mean_power(plates.own[0][..., None], self._weights))
         by_load = own_size * np.abs(release)[..., None]
-        load = by_load * np.float32(load_std) * (self._finger_stiffness * release)[..., None]
-        field = load * plates.unloaded[0] * eras.acceleration_per_transfer
+        reaction = self._finger_stiffness * release
+        load = by_load * np.float32(load_std) * reaction[..., None]
+        field = load * plates.unloaded[0] * self._acceleration_per_transfer(eras)
         return np.concatenate([by_stiffness, field[:, :, None]], axis=2)
 
     def _field_error(
         self,
         places: PlaceReceptances,
         chosen: IntArray,
-        eras: _MountedEras,
+        eras: Mounts,
         coupling: Complex64Array,
     ) -> Float32Array:
         """Return the power (f, 1, n) of the model's errors, relative to the whole plate."""
@@ -280,10 +271,21 @@ class Scorer:
         field_std = self._rig.uncertainty.field
         if field_std > 0:
             to_plate = places.to_plate[:, :, chosen]
-            over_plate = to_plate @ coupling * eras.acceleration_per_transfer
+            over_plate = to_plate @ coupling * self._acceleration_per_transfer(eras)
             mean_square = (np.abs(over_plate) ** 2).mean(axis=1, keepdims=True)
             error += np.float32(field_std**2) * mean_square
         return error
+
+    def _field_by_damping(
+        self, transfer: Complex64Array, eras: Mounts, motion: Complex64Array
+    ) -> Complex64Array:
+        """Return the change dc (f, m, p, n) of the field per standard deviation of the damping.
+
+        transfer (f, m, p, n): of the nominal plate.
+        """
+        flat_transfer = transfer.reshape(len(transfer), -1, transfer.shape[-1])
+        force = self._minus_omega2 * eras.by_damping[:, :, None] * motion
+        return np.asarray((flat_transfer @ force).reshape(transfer.shape))
 
     # Scores of fields
 
@@ -321,9 +323,10 @@ class Scorer:
         for step in range(_LAWSON_STEPS + 1):
             by_finger = w[:, :, None]
             expected = np.vecdot(by_finger, np.matvec(power, by_finger)).real
-            peak = np.abs(np.vecdot(c, w))
-            score = peak**2 / np.maximum(expected.max(axis=2), _SMALLEST)
-            best = np.maximum(best, self._decibels(score, c, w, rows).max(axis=0))
+            loudest = np.maximum(expected.max(axis=2), _SMALLEST)
+            score = np.abs(np.vecdot(c, w)) ** 2 / loudest
+            decibels = self._decibels(score, c, w, rows)
+            best = np.maximum(best, decibels.max(axis=0))
             if step < _LAWSON_STEPS:
                 shares = shares * np.sqrt(np.maximum(expected, _SMALLEST))
                 shares /= shares.sum(axis=2, keepdims=True)
@@ -373,18 +376,6 @@ def _grouped_by_size(numbers: IntArray, sizes: Sequence[int]) -> tuple[IntArray,
         of_size = starts[np.equal(sizes, size)]
         groups.append(numbers[of_size[:, None] + np.arange(size)])
     return tuple(groups)
-
-
-def _field_by_damping(
-    transfer: Complex64Array, eras: _MountedEras, motion: Complex64Array
-) -> Complex64Array:
-    """Return the change dc (f, m, p, n) of the field per standard deviation of the damping.
-
-    transfer (f, m, p, n): of the nominal plate.
-    """
-    flat_transfer = transfer.reshape(len(transfer), -1, transfer.shape[-1])
-    force = eras.minus_omega2 * eras.by_damping[:, :, None] * motion
-    return np.asarray((flat_transfer @ force).reshape(transfer.shape))
 
 
 def _mean_power(values: Complex64Array, weights: Float32Array) -> Float32Array:

@@ -217,7 +217,7 @@ def _warn_of_light(eras: dict[str, dict[str, Any]]) -> None:
     if light:
         typer.echo(
             f"era: warning: {', '.join(light)}: carries less than {min_load:.2f} N of the plate's "
-            "weight, a fifth of the mean; a finger can lift the plate off: fasten it there, or "
+            f"weight, {LIGHT:g} of the mean; a finger can lift the plate off: fasten it there, or "
             "exclude these positions with --where",
             err=True,
         )

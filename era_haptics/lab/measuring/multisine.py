@@ -26,6 +26,7 @@ _DRAWS = 20  # random phases; the lowest crest factor among them is 3.1 to 3.6
 _RAMP = 0.02  # s
 _STEP = 10  # Hz
 _AROUND = 4  # lines on either side for the noise estimate
+_SMALLEST = 1e-300  # in place of a divisor of 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,23 +168,32 @@ def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEs
     lines = multisine.lines * periods
     received = spectra[:, lines]  # (runs, f, inputs)
     played = np.array([multisine.played(run) for run in range(len(recorded))])  # (runs, f, s)
+    noise = _noise_power(spectra, lines, periods)
+    power = (np.abs(received) ** 2).mean(axis=0)
+    amplitudes = np.abs(multisine.played(0)[:, :1])
+    return ResponseEstimate(
+        values=_least_squares(played, received),
+        std=np.sqrt(noise / len(recorded)) / amplitudes,
+        coherence=np.clip(1 - noise / np.maximum(power, _SMALLEST), 0.0, 1.0),
+        even=_even_lines(spectra, lines, periods, noise),
+    )
+
+
+def _least_squares(played: ComplexArray, received: ComplexArray) -> ComplexArray:
+    """Return the responses H (f, inputs, s) from amplitudes (runs, f, s) and (runs, f, inputs)."""
     U = played.transpose(1, 0, 2)
     Y = received.transpose(1, 0, 2)
     adjoint = U.conj().swapaxes(1, 2)
-    values = np.linalg.solve(adjoint @ U, adjoint @ Y)
-    # The noise is in the bins around each line that no period has.
+    transposed = np.linalg.solve(adjoint @ U, adjoint @ Y)
+    return np.asarray(transposed.transpose(0, 2, 1))
+
+
+def _noise_power(spectra: ComplexArray, lines: IntArray, periods: int) -> FloatArray:
+    """Return the mean power of noise (f, inputs), from bins around each line without any signal."""
     offsets = np.arange(-_AROUND * periods, _AROUND * periods + 1)
     offsets = offsets[offsets % periods != 0]
     bins = np.clip(lines[:, None] + offsets, 1, spectra.shape[1] - 1)
-    noise = np.asarray((np.abs(spectra[:, bins]) ** 2).mean(axis=(0, 2)))
-    power = (np.abs(received) ** 2).mean(axis=0)
-    size = np.abs(multisine.played(0)[:, :1])
-    return ResponseEstimate(
-        values.transpose(0, 2, 1),
-        np.sqrt(noise / len(recorded)) / size,
-        np.clip(1 - noise / np.maximum(power, 1e-300), 0.0, 1.0),
-        _even_lines(spectra, lines, periods, noise),
-    )
+    return np.asarray((np.abs(spectra[:, bins]) ** 2).mean(axis=(0, 2)))
 
 
 def _even_lines(
@@ -191,6 +201,7 @@ def _even_lines(
 ) -> FloatArray:
     """Return the amplitude at the even lines, relative to the played lines, (inputs,)."""
     even_lines = lines + periods
-    power = (np.abs(spectra[:, even_lines]) ** 2).mean(axis=0) - noise
-    played = (np.abs(spectra[:, lines]) ** 2).mean(axis=0).sum(axis=0)
-    return np.asarray(np.sqrt(np.maximum(power.sum(axis=0), 0) / np.maximum(played, 1e-300)))
+    even_power = ((np.abs(spectra[:, even_lines]) ** 2).mean(axis=0) - noise).sum(axis=0)
+    played_power = (np.abs(spectra[:, lines]) ** 2).mean(axis=0).sum(axis=0)
+    ratio = np.maximum(even_power, 0) / np.maximum(played_power, _SMALLEST)
+    return np.asarray(np.sqrt(ratio))

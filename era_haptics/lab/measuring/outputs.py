@@ -20,7 +20,11 @@ from scipy.optimize import linear_sum_assignment
 
 from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.multisine import Multisine, ResponseEstimate, estimate, ramped
-from era_haptics.lab.measuring.recording_checks import check_levels
+from era_haptics.lab.measuring.recording_checks import (
+    MIN_COHERENCE,
+    MIN_RESPONSE,
+    check_levels,
+)
 from era_haptics.lab.measuring.runs import play_on_one, run_time
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import ComplexArray, FloatArray, IntArray
@@ -47,8 +51,6 @@ _OCTAVES = 4.0  # highest over lowest line
 _STEP = 20  # Hz; lines are one above its multiples, so that sums of two fall between lines
 _PERIODS = 2
 _DELAYS = np.arange(0, 0.05, 1e-4)  # s
-_MOVED = 5.0  # times the noise, in the median over frequencies
-_COHERENT = 0.9
 _RATTLE = 0.1  # of the lines played, at even ones
 _WEAK = 0.5  # of the median level
 _MARGIN = 0.05  # of the mean correlation, over the next best assignment
@@ -135,7 +137,7 @@ def _findings(
     values = np.array([[output.values[:, 0, 0] for output in row] for row in estimates])
     noise = np.array([[output.std[:, 0] for output in row] for row in estimates])
     ratios = np.median(np.abs(values) / noise, axis=2).max(axis=0)  # (outputs,)
-    audible = np.flatnonzero(ratios >= _MOVED)
+    audible = np.flatnonzero(ratios >= MIN_RESPONSE)
     if not audible.size:
         raise InputError("no output moves the plate: check amplifier, its supply and cables")
     responses = values[:, audible].transpose(1, 2, 0)
@@ -156,7 +158,7 @@ def _findings(
 
 def _verdict(response: ResponseEstimate, *, sign: int, level: float) -> str:
     """Return the verdict on an output that moves the plate; response: next to its actuator."""
-    if response.even[0] > _RATTLE or np.median(response.coherence) < _COHERENT:
+    if response.even[0] > _RATTLE or np.median(response.coherence) < MIN_COHERENCE:
         return "loose: it rattles; fasten it"
     if level < _WEAK:
         return "loose, or its gain is low: fasten it, and check the amplifier's knob"

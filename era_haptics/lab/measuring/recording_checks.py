@@ -22,6 +22,13 @@ SILENT = 1e-5
 CROSSTALK = 0.02
 """Of the loop-back, allowed for other outputs."""
 
+MIN_COHERENCE = 0.9
+"""Lowest coherence of a sensor, in the median over frequencies."""
+
+MIN_RESPONSE = 5.0
+"""Smallest response to an output that moves the plate, relative to the noise, in the median over
+frequencies and the maximum over sensors."""
+
 _MAX_DELAY = 0.1  # s; lines 10 Hz apart repeat then
 _MIN_MATCH = 0.95  # of the best match of a delay, for shorter ones
 _MAX_CURVATURE = 0.5  # rad; of a phase that is a straight line
@@ -32,9 +39,7 @@ _MIN_SIMILARITY = 0.999  # of the periods, after correction of the drift
 _CERTAIN = 5.0  # standard errors
 _FULL_SCALE = 0.999
 _LOOPED = 0.05  # of a sample that a loop-back brings back at least
-_COHERENT = 0.9  # in the median over frequencies
 _FAINT = 0.01  # of full scale; below it, converter noise is audible next to the signal
-_MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
 _SMALLEST = 1e-300  # in place of a divisor of 0
 
 
@@ -220,7 +225,7 @@ def check_coherence(
     faint: list[str] = []
     disturbed: list[str] = []
     for sensor, coherence, peak in zip(wiring.sensors, coherences, peaks, strict=True):
-        if coherence < _COHERENT:
+        if coherence < MIN_COHERENCE:
             rows = faint if peak < _FAINT else disturbed
             level = f"input up to {100 * peak:.2g} % of full scale"
             rows.append(f"{sensor.name} ({coherence:.2f}, {level})")
@@ -230,7 +235,7 @@ def check_coherence(
     ):
         if sensors:
             raise LinkError(
-                f"coherence must be at least {_COHERENT:g} in the median, got "
+                f"coherence must be at least {MIN_COHERENCE:g} in the median, got "
                 f"{', '.join(sensors)}; {remedy}"
             )
     _check_moved(estimate, wiring, is_heard=is_heard)
@@ -242,7 +247,7 @@ def _check_moved(estimate: ResponseEstimate, wiring: SoundCardWiring, *, is_hear
     ratios = values / estimate.std[:, wiring.sensor_columns, None]
     ratio_by_source = np.median(ratios, axis=0).max(axis=0)
     for (name, output), ratio in zip(wiring.era_outputs.items(), ratio_by_source, strict=False):
-        if ratio >= _MOVED:
+        if ratio >= MIN_RESPONSE:
             continue
         if is_heard:
             raise LinkError(

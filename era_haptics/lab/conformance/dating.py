@@ -15,15 +15,13 @@ _CLOCK_ERROR = QUANTITIES["clock_error"]
 
 
 class Dating:
-    """Convert times [s] to the clock of an amplifier, which starts near this machine's time.
-
-    pace: seconds of the clock per second of its crystal. error: largest contradiction between
-    readings beyond the allowed drift [s].
-    """
+    """Convert times [s] to the clock of an amplifier, which starts near this machine's time."""
 
     def __init__(self) -> None:
         self.pace = 1.0
+        """Seconds of the clock per second of its crystal."""
         self.error = 0.0
+        """Largest contradiction between readings, beyond the allowed drift [s]."""
         self._clock: int | None = None  # the last reading
         self._read_by = 0.0  # s; end of its interval, by this machine
         self._time = 0.0  # s; of the last reading, by the amplifier's clock

@@ -67,20 +67,7 @@ class RequestOutcome:
 
 
 class JudgeClient(ABC):
-    """One amplifier at an address of a line.
-
-    - number: of the last request. session: begun last.
-    - inbox: messages that no request was waiting for, except Events. history: all messages as
-      received.
-    - reply_words: longest reply to each message by message number, if known.
-    - quiet: time within which a reply arrives [s]. timeout: how long a reply is awaited [s].
-    - wire_time: time on the wire for a request and a reply, from their word counts [s]. transit:
-      wire time of the longest reply.
-    - loss: why the line was lost. last_bytes: received since the last request.
-    - neighbors: other addresses that reply. free_address: the highest address without a reply.
-      Both are set by `look_around`.
-    - lateness: of this machine and of replies.
-    """
+    """One amplifier at an address of a line."""
 
     kind: ClassVar[str]
     """Kind of wire: serial, rtu, tcp or can."""
@@ -101,19 +88,33 @@ class JudgeClient(ABC):
     def __init__(self, address: int) -> None:
         self.address = address
         self.number = 0
+        """Number of the last request."""
         self.session = 0
+        """Session begun last."""
         self.inbox: list[HeardMessage] = []
+        """Messages that no request was waiting for, except Events."""
         self.history: list[HeardMessage] = []
+        """All messages, in the order of their arrival."""
         self.reply_words: dict[int, int] = {}
+        """Length of the longest reply to each message by message number, if known."""
         self.quiet = QUIET_TIME
+        """Time within which a reply arrives [s]."""
         self.timeout = JUDGE_REPLY_TIMEOUT
+        """Time for which a reply is awaited [s]."""
         self.wire_time: Callable[[int, int], float] = lambda words, reply_words: 0.0
+        """Time on the wire for a request and a reply, from their word counts [s]."""
         self.transit = 0.0
+        """Time on the wire of the longest reply [s]."""
         self.loss: str | None = None
+        """Why the line was lost; None while it is open."""
         self.last_bytes = b""
+        """Bytes received since the last request."""
         self.neighbors: frozenset[int] = frozenset()
+        """Other addresses that reply; set by `look_around`."""
         self.free_address = 0
+        """Highest address without a reply; 0 before `look_around`."""
         self.lateness = Lateness()
+        """Lateness of this machine and of replies."""
         self._heard_addresses: set[int] = set()
         self._news = asyncio.Event()
 

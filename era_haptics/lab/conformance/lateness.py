@@ -18,20 +18,19 @@ _INTERVAL = 0.005  # s; between two measurements of this machine's lateness
 
 
 class Lateness:
-    """Lateness during a run of checks.
-
-    attempts: repetitions of the current check because of lateness. wasted: their total time in the
-    run [s]. lag: this machine's largest lateness in an attempt [s]. largest: the largest lateness
-    of this machine or of a reply in the run [s]. reactions: times until a reply began [s], by
-    message name, "refusals" for rejections.
-    """
+    """Lateness during a run of checks."""
 
     def __init__(self) -> None:
         self.attempts = 0
+        """Repetitions of the current check because of lateness."""
         self.wasted = 0.0
+        """Total time of all repetitions in the run [s]."""
         self.lag = 0.0
+        """Largest lateness of this machine in an attempt [s]."""
         self.largest = 0.0
+        """Largest lateness of this machine, or of a reply, in the run [s]."""
         self.reactions: dict[str, list[float]] = defaultdict(list)
+        """Times until a reply began [s], by message name, "refusals" for rejections."""
 
     @property
     def slow_reply(self) -> str:

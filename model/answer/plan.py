@@ -375,7 +375,9 @@ class _Search:
 
         If not even the first can be served, the best of the answers tried is returned.
         """
-        order = sorted(plan.contents, key=lambda content: self._order_key(content, tried[-1]))
+        order = [*plan.contents]
+        if len(order) > 1:  # each key needs an answer
+            order.sort(key=lambda content: self._order_key(content, tried[-1]))
         served: list[tuple[int, ...]] = []
         result = self._measure(replace(plan, contents=()))
         with_content = dict.fromkeys(order, tried[-1])

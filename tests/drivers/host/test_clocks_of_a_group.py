@@ -387,10 +387,7 @@ async def test_clocks_on_separate_lines_agree_to_microseconds(lost: float) -> No
 
 @pytest.mark.parametrize(
     ("kind", "bound"),
-    [
-        pytest.param("usb-high-speed", 150e-6, marks=pytest.mark.long),
-        ("usb-full-speed", 300e-6),
-    ],
+    [("usb-full-speed", 300e-6)],
 )
 @pytest.mark.parametrize("lines", [("a", "b", "c", "d"), ("abcd",)], ids="-".join)
 @in_virtual_time

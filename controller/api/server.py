@@ -16,7 +16,6 @@ limit (`controller/api/silencing.py`). Its errors are reported afterwards.
 
 import asyncio
 import logging
-import math
 import socket
 import time
 from collections import Counter, deque
@@ -84,7 +83,7 @@ class Connection(asyncio.BufferedProtocol):
         self.is_reserve = False  # whether it is in reserve
         self.pending: set[asyncio.Task[None]] = set()  # requests without responses
         self.silencing_count = 0  # its stops and disarms so far
-        self.touched_at = -math.inf  # s; when it last sent fingers, unless it has lifted them since
+        self.touched_at: float | None = None  # s; when it last sent fingers; None if none are down
         self.rate = RateLimiter(MAX_REQUEST_RATE, clock=server.clock)
         self._server = server
         self._received = memoryview(bytearray(_MAX_READ))
@@ -92,7 +91,7 @@ class Connection(asyncio.BufferedProtocol):
         self._line_end = -1  # end of the next line in _input; -1: not received yet
         self._stop_at = -1  # position of the last possible stop in _input; -1: none
         self._lost = 0
-        self._losing_since = math.inf  # s
+        self._losing_since: float | None = None  # s; None unless notifications are being dropped
 
     @property
     def is_open(self) -> bool:
@@ -161,7 +160,7 @@ class Connection(asyncio.BufferedProtocol):
         """Record that the client silences or touches."""
         self.silencing_count += METHODS[method].silences
         if isinstance(params, TouchParams):
-            self.touched_at = self._server.clock() if params.touches else -math.inf
+            self.touched_at = self._server.clock() if params.touches else None
 
     def next_line(self) -> bytes:
         """Take the next line, or the start of an overlong line and stop reading."""
@@ -210,11 +209,12 @@ class Connection(asyncio.BufferedProtocol):
         if self._transport.get_write_buffer_size() < MAX_UNREAD_BYTES // 2:
             self._transport.write(make_line(self._lost))
             self._lost = 0
-            self._losing_since = math.inf
+            self._losing_since = None
             return False
         now = self._server.clock()
         self._lost += 1
-        self._losing_since = min(self._losing_since, now)
+        if self._losing_since is None:
+            self._losing_since = now
         if now - self._losing_since > UNREAD_TIMEOUT:
             self.abort()
         return True
@@ -453,7 +453,8 @@ class ApiServer:
         if client.is_urgent:
             return 0
         # Fingers that the client no longer reports count as lifted.
-        touches = self.clock() - client.touched_at <= CONTACT_TIMEOUT
+        at = client.touched_at
+        touches = at is not None and self.clock() - at <= CONTACT_TIMEOUT
         return 1 if touches or self._holds_lease(client) else 2
 
     def _serve(self, client: Connection, line: bytes) -> None:

@@ -12,15 +12,14 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from controller.api.methods import ReloadResult
-from controller.api.schema import AmplifierStatus, headline
+from controller.api.schema import headline
 from controller.api.server import ApiServer
-from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway
 from controller.daemon.config import DaemonConfig, load_daemon_config, loopback_address
 from controller.daemon.handlers import ApiService
@@ -30,7 +29,6 @@ from controller.daemon.reload import ConfigReload
 from controller.gateway.gateway_settings import require_gateway
 from controller.operation.operation_states import ENERGISED, Operation
 from controller.operation.plate_controller import Controller
-from controller.operation.reopening import LinkChange
 from controller.operation.supervisor import Supervisor
 from controller.play.reports import Observers
 from controller.process.daemon_process import (
@@ -96,9 +94,7 @@ class Daemon:
         self._gateway: asyncio.Task[None] | None = None
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self.layouts = LayoutChoice(
-            rendered_config, table.frequencies, changed=self._layout_changed
-        )
+        self.layouts = LayoutChoice(rendered_config, table.frequencies)
         self.controller = Controller(
             config.rig,
             table,
@@ -110,12 +106,7 @@ class Daemon:
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
-        self.supervisor = Supervisor(
-            self.controller,
-            state_changed=(self._publish_state, self._notify_manager),
-            link_changed=self._publish_link,
-            alive=lambda: manager.alive(threads.now()),
-        )
+        self.supervisor = Supervisor(self.controller, alive=lambda: manager.alive(threads.now()))
         self.started = self.supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
         self._config_reload = ConfigReload(
@@ -128,16 +119,12 @@ class Daemon:
         )
         cycle = self.controller.cycle
         cycle.tracker.max_fingers = config.section.max_fingers
-        self.inputs = TouchInputs(
-            cycle.deliver, cycle.lift, rejects=cycle.rejects, changed=self._inputs_changed
-        )
+        self.inputs = TouchInputs(cycle.deliver, cycle.lift, rejects=cycle.rejects)
         self.publisher = EventPublisher(
-            operation=lambda: self.supervisor.operation,
-            amplifiers=self._amplifier_statuses,
-            layouts=self.layouts,
-            inputs=lambda: self.inputs.event,
+            self.supervisor, layouts=self.layouts, touch_inputs=self.inputs
         )
-        self.publisher.observe(cycle.observers)
+        self.supervisor.current.observers.append(self._notify_manager)
+        self.layouts.observers.append(cycle.request_update)
         observe(cycle.observers)
         self.api = ApiService(
             # Without layouts, so that these can be freed once they are replaced.
@@ -163,29 +150,8 @@ class Daemon:
         """The configuration in use."""
         return self._config_reload.config
 
-    def _publish_link(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
-        self.publisher.link_changed(change, lost, message)
-
-    def _publish_state(self, old: Operation, new: Operation) -> None:
-        self.publisher.state_changed(old, new)
-
     def _notify_manager(self, old: Operation, new: Operation) -> None:
         self._manager.notify(f"STATUS={headline(new.state.value, new.cause)}")
-
-    def _amplifier_statuses(self) -> list[AmplifierStatus]:
-        group = self.controller.group
-        return amplifier_statuses(
-            self.controller.amplifiers,
-            self.config.urls,
-            are_open=group.is_open,
-            lost=self.supervisor.operation.lost,
-            what_may_play=self.supervisor.reopening.what_may_play,
-            clock_errors=group.clock_errors,
-            targets=self.publisher.view.targets,
-        )
-
-    def _inputs_changed(self) -> None:
-        self.publisher.hub.publish("inputs", self.publisher.inputs)
 
     async def run(self, lock: SocketLock) -> None:
         """Open, serve until terminated, silence the amplifiers and close.
@@ -246,10 +212,6 @@ class Daemon:
 
     def _reload_ended(self) -> None:
         self._manager.ready(self._status_line())
-
-    def _layout_changed(self) -> None:
-        self.publisher.hub.publish("layout", self.layouts.event)
-        self.controller.cycle.request_update()
 
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""

@@ -45,14 +45,12 @@ class LayoutChoice:
     """The layouts of a daemon's configuration; the first is current until another is chosen.
 
     config: configuration rendered for the table's frequencies [Hz].
-    changed: called after the current layout or its content changes.
     """
 
-    def __init__(
-        self, config: DaemonConfig, frequencies: FloatArray, *, changed: Callable[[], None]
-    ) -> None:
+    def __init__(self, config: DaemonConfig, frequencies: FloatArray) -> None:
         self._layouts = config.layouts
-        self._changed = changed
+        self.observers: list[Callable[[], None]] = []
+        """Called after the current layout or its content changes."""
         self.name = next(iter(self._layouts))
         """Name of the current layout; None if no layout is configured."""
         self.player = EffectPlayer(
@@ -104,7 +102,8 @@ class LayoutChoice:
         self.name = name
         self.player.replace(self._layouts[name])
         _logger.info("layout: using %s", name or "none")
-        self._changed()
+        for observer in self.observers:
+            observer()
 
 
 class TouchInputs:
@@ -114,7 +113,6 @@ class TouchInputs:
         name.
     lift: receives the prefix of a source that ends, fails or is cancelled.
     rejects: counter shared by all sources.
-    changed: called after `event` changes.
     """
 
     def __init__(
@@ -123,12 +121,12 @@ class TouchInputs:
         lift: Callable[[str], None],
         *,
         rejects: RejectCounter,
-        changed: Callable[[], None] = lambda: None,
     ) -> None:
         self.deliver = deliver
         self._lift = lift
         self._rejects = rejects
-        self._changed = changed
+        self.observers: list[Callable[[], None]] = []
+        """Called after `event` changes."""
         self._sources: dict[TouchInput, TouchSource | str | None] = {}
         """Source of each input; a text with the reason while it is missing; None after its end."""
         self._running: list[asyncio.Task[None]] = []
@@ -202,7 +200,8 @@ class TouchInputs:
         event = InputsEvent(inputs=statuses, rejected_touches=dict(self._rejects.counts))
         if event != self.event:
             self.event = event
-            self._changed()
+            for observer in self.observers:
+                observer()
 
     async def _watch(self) -> None:
         """Update the state of all inputs periodically."""

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 
@@ -38,14 +38,16 @@ from controller.api.schema import (
     RigSummary,
     TableSummary,
 )
+from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.daemon.config import DaemonConfig
-from controller.daemon.layouts import LayoutChoice
+from controller.daemon.layouts import LayoutChoice, TouchInputs
 from controller.daemon.plate_view import PlateView
 from controller.effects.layout import SurfaceLayout
 from controller.effects.strengths import UNNAMED
 from controller.operation.operation_states import DaemonState, Operation
 from controller.operation.reopening import LinkChange
-from controller.play.reports import Observers, PlayReport
+from controller.operation.supervisor import Supervisor
+from controller.play.reports import PlayReport
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier
 from drivers.protocol.definition import READINGS
@@ -65,56 +67,79 @@ _logger = logging.getLogger(__name__)
 class EventPublisher:
     """Keeps the state of the plate up to date and sends every change to subscribed clients.
 
-    operation, amplifiers, inputs: return the current state of the daemon, of its amplifiers and of
-        its touch inputs.
-    layouts: the surface layouts of the daemon.
+    It observes the supervisor, the control loop, the surface layouts and the touch inputs.
     """
 
     def __init__(
-        self,
-        *,
-        operation: Callable[[], Operation],
-        amplifiers: Callable[[], list[AmplifierStatus]],
-        layouts: LayoutChoice,
-        inputs: Callable[[], InputsEvent],
+        self, supervisor: Supervisor, *, layouts: LayoutChoice, touch_inputs: TouchInputs
     ) -> None:
         self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
+        self._supervisor = supervisor
+        self._layouts = layouts
+        self._touch_inputs = touch_inputs
         self._player = layouts.player
         self.latencies = LatencyStatistics()  # touches only
         self.lift_latencies = LatencyStatistics()
-        self.amplifiers = amplifiers
-        self.inputs = inputs
-        self._operation = operation
         self._last_link_message = ""
         self._loop = asyncio.get_running_loop()
         self.hub = Hub(
             {
-                "state": lambda: _state_event(operation(), operation()),
+                "state": self._state_event,
                 "contacts": self.view.contacts_event,
                 "pattern": self.view.pattern_event,
                 "silence": self.view.silence_event,
-                "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
+                "amplifiers": lambda: AmplifiersEvent(amplifiers=self.amplifiers()),
                 "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
                 "layout": layouts.event,
-                "inputs": inputs,
+                "inputs": self.inputs,
                 "strength": self.strengths,
             },
             clock=threads.now,
         )
 
-    def observe(self, loop: Observers) -> None:
-        """Subscribe to the reports of the control loop."""
+        supervisor.current.observers.append(self._state_changed)
+        supervisor.link_observers.append(self._link_changed)
+        loop = supervisor.controller.cycle.observers
         loop.contacts_changed.append(self._contacts_changed)
         loop.reported.append(self._reported)
         loop.refused.append(self._refused)
+        layouts.observers.append(self._layout_changed)
+        touch_inputs.observers.append(self._inputs_changed)
 
-    def state_changed(self, old: Operation, new: Operation) -> None:
+    def amplifiers(self) -> list[AmplifierStatus]:
+        """Describe all amplifiers from their last statuses."""
+        controller = self._supervisor.controller
+        return amplifier_statuses(
+            controller.amplifiers,
+            controller.urls,
+            are_open=controller.group.is_open,
+            lost=self._supervisor.operation.lost,
+            what_may_play=self._supervisor.reopening.what_may_play,
+            clock_errors=controller.group.clock_errors,
+            targets=self.view.targets,
+        )
+
+    def inputs(self) -> InputsEvent:
+        """Return the state of the touch inputs."""
+        return self._touch_inputs.event
+
+    def _state_event(self) -> StateEvent:
+        operation = self._supervisor.operation
+        return _transition_event(operation, operation)
+
+    def _layout_changed(self) -> None:
+        self.hub.publish("layout", self._layouts.event)
+
+    def _inputs_changed(self) -> None:
+        self.hub.publish("inputs", self.inputs)
+
+    def _state_changed(self, old: Operation, new: Operation) -> None:
         """Publish a transition of the daemon, and the resulting silence.
 
         Nothing plays outside OPERATION_ENABLED. The control loop does not report silence that
         another part of the daemon has caused.
         """
-        self.hub.publish("state", lambda: _state_event(old, new))
+        self.hub.publish("state", lambda: _transition_event(old, new))
         if new.state is DaemonState.OPERATION_ENABLED:
             return
         was_playing = self.view.applied is not None
@@ -126,23 +151,24 @@ class EventPublisher:
 
     def _why_not(self, key: ContactKey) -> str:
         """Return why a contact feels no effect of its own, if the loop has not reported it."""
-        operation = self._operation()
+        operation = self._supervisor.operation
         if operation.state is not DaemonState.OPERATION_ENABLED:
             return f"{STATE_WORDS[operation.state]}: {operation.next_step or operation.cause}"
         if operation.degraded:
             return f"{operation.cause}; {operation.remedy}"
         return self._player.why_not(key)
 
-    def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+    def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         """Publish that the link to amplifiers was degraded, restored, lost, retried or reopened."""
         if change == "retry" and message != self._last_link_message:
             _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
         self._last_link_message = message
+        remedy = self._supervisor.operation.remedy
         event = LinkEvent(
             event=change,
             amplifier=lost[0] if len(lost) == 1 else None,
             message=message,
-            remedy=None if change in ("restored", "reopened") else self._operation().remedy,
+            remedy=None if change in ("restored", "reopened") else remedy,
         )
         self.hub.publish("link", lambda: event)
 
@@ -205,7 +231,7 @@ class EventPublisher:
             self.hub.publish("silence", self.view.silence_event)
 
 
-def _state_event(old: Operation, new: Operation) -> StateEvent:
+def _transition_event(old: Operation, new: Operation) -> StateEvent:
     return StateEvent(
         old=old.state.value,
         new=new.state.value,

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
@@ -28,19 +28,17 @@ StateObserver: TypeAlias = Callable[[Operation, Operation], None]
 class CurrentOperation:
     """Holds the operation, notifies observers of every new epoch, and watches the lease.
 
-    observers: called a moment after each change of the state or its epoch. lease_over: called when
-    the client that armed has not renewed its lease.
+    lease_over: called when the client that armed has not renewed its lease.
     """
 
-    def __init__(
-        self, observers: Sequence[StateObserver], *, lease_over: Callable[[], None]
-    ) -> None:
+    def __init__(self, *, lease_over: Callable[[], None]) -> None:
         # Differs from the epochs of an earlier daemon, whose clients may reconnect.
         self.value = Operation(epoch=secrets.randbelow(_EPOCHS))
         """The operation; only the methods of this class replace it."""
         self.reports = DeferredCalls()
         """Calls of observers."""
-        self._observers = observers
+        self.observers: list[StateObserver] = []
+        """Called a moment after each change of the state or its epoch."""
         self._lease_over = lease_over
         self._lease_timer: asyncio.TimerHandle | None = None
         self._changed = asyncio.Event()
@@ -72,7 +70,7 @@ class CurrentOperation:
         if operation.epoch == last_operation.epoch:
             return
         self._changed.set()
-        for observer in self._observers:
+        for observer in self.observers:
             self.reports.add(partial(observer, last_operation, operation))
         if self._lease_timer is not None:
             self._lease_timer.cancel()

@@ -21,7 +21,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
-from controller.operation.current_operation import CurrentOperation, StateObserver
+from controller.operation.current_operation import CurrentOperation
 from controller.operation.deferred_calls import call_guarded
 from controller.operation.operation_states import (
     ENERGISED,
@@ -84,24 +84,16 @@ class Supervisor:
     or action stops all amplifiers and ends in FAULT.
 
     controller: opens, arms and stops the amplifiers.
-    state_changed: called shortly after every change of the state or its epoch.
-    link_changed: receives the kind of change, the affected amplifiers, if known, and a message.
     alive: called after each cycle of the control loop, which runs in every state.
     """
 
-    def __init__(
-        self,
-        controller: Controller,
-        *,
-        state_changed: Sequence[StateObserver],
-        link_changed: LinkObserver,
-        alive: Callable[[], None],
-    ) -> None:
+    def __init__(self, controller: Controller, *, alive: Callable[[], None]) -> None:
         self.controller = controller
-        self.current = CurrentOperation(
-            (_log_transition, *state_changed), lease_over=partial(self.post, LEASE_OVER)
-        )
-        """The current operation."""
+        self.current = CurrentOperation(lease_over=partial(self.post, LEASE_OVER))
+        """The current operation, with the observers of its state."""
+        self.current.observers.append(_log_transition)
+        self.link_observers: list[LinkObserver] = []
+        """Observers of the links to the amplifiers."""
         self.started = asyncio.Event()
         """Set once the amplifiers are open, or searched for."""
         self.closing = asyncio.Event()
@@ -110,7 +102,6 @@ class Supervisor:
         """Actions in progress."""
         self.reopening = Reopening(controller, self.current, self._report_link)
         """Opens lost amplifiers again."""
-        self._link_observer = link_changed
         self._alive = alive
         self._loss_lock = asyncio.Lock()
         """Held until the lost amplifiers are closed."""
@@ -411,8 +402,9 @@ class Supervisor:
         return self.operation.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
 
     def _report_link(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
-        """Report a change of the links to the observer, a moment later."""
-        self.current.reports.add(partial(self._link_observer, change, lost, message))
+        """Report a change of the links to the observers, a moment later."""
+        for observer in self.link_observers:
+            self.current.reports.add(partial(observer, change, lost, message))
 
     async def _run_control_loop(self) -> None:
         """Run the control loop; an unforeseen exception is a fault, which can be cleared."""

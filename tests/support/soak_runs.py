@@ -529,12 +529,9 @@ class Soak(Chain):
     def make_host(self, **more: Any) -> None:
         """Make a supervisor with its control loop."""
         super().make_host(**more)
-        self.supervisor = Supervisor(
-            self.controller,
-            state_changed=(lambda old, new: self.note("state", new.state),),
-            link_changed=self._link_changed,
-            alive=lambda: None,
-        )
+        self.supervisor = Supervisor(self.controller, alive=lambda: None)
+        self.supervisor.current.observers.append(lambda old, new: self.note("state", new.state))
+        self.supervisor.link_observers.append(self._link_changed)
         loop = self.controller.cycle.observers
         loop.reported.append(self._applied)
         loop.refused.append(lambda why: self.note("observer refused", why))

@@ -831,12 +831,10 @@ async def watched(
         getattr(daemon, name).append(value)
 
     async with set_chain(*amplifiers, of=Watched, **options) as daemon:
-        daemon.supervisor = supervisor = Supervisor(
-            daemon.controller,
-            state_changed=[lambda old, new: heard("states", new.state)],
-            link_changed=lambda event, lost, message: heard("links", event),
-            alive=lambda: heard("alive", threads.now()),
-        )
+        supervisor = Supervisor(daemon.controller, alive=lambda: heard("alive", threads.now()))
+        supervisor.current.observers.append(lambda old, new: heard("states", new.state))
+        supervisor.link_observers.append(lambda event, lost, message: heard("links", event))
+        daemon.supervisor = supervisor
         loop = daemon.controller.cycle.observers
         loop.cycle_completed.append(lambda: heard("cycles", threads.now()))
         loop.refused.append(lambda reason: heard("refused", reason))

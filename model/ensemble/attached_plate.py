@@ -5,12 +5,12 @@ eliminates these, for each thickness and once per table.
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²), s
 lambda = (1 + i eta) lambda + i loss. A plate that is thicker by a factor has modal masses larger by
-this factor and frequencies higher by it (as in `model.reduction.free_plate`); another modulus
+this factor, and frequencies higher by this factor (`model.reduction.free_plate`); another modulus
 changes the frequencies alone. With h times the thickness, and frequencies q times as high,
 
     g = 1 / (h (q² s lambda - w²)),    dg / d ln loss = -i h q² Im(s lambda) g².
 
-Plates are drawn along one axis, that of q; h is the expected value for a plate with that q. Modes
+Plates are drawn along the axis of q; h is the expected value for a plate with this q. Modes
 with individually uncertain frequency and amplitude are drawn separately for each plate: with
 frequency factor v and amplitude factor a of a mode,
 
@@ -29,10 +29,10 @@ uncertainty the other parameters change the response nearly in proportion.
 
 Sources can also be misplaced. A source acts with its force F on a plate that moves by w, F = F_0 -
 Z w when all sources are driven. At shapes phi + d it adds a force F d - phi Z d w: a couple, and a
-force at its own place. For an ERA, which is stiff, both count as an equivalent error of its
+force at its own position. For an ERA, which is stiff, both count as an equivalent error of its
 stiffness, which changes the fields of all sources. An exciter is a force driven by its own signal;
 there such an error would be a gain error, which changes nothing at fingers in a null, although the
-field of a couple has another shape. The part of the couple's field along that of the force
+field of a couple has another shape. The part of the couple's field along the force's field
 therefore counts as an error of stiffness, and the rest as an error of the source's field, at each
 finger.
 """
@@ -183,7 +183,7 @@ class AttachedPlate(Mounts):
         return stiffness.astype(np.complex64)
 
     def load_stds(self, count: int, loads: Sequence[float] = ()) -> Float32Array:
-        """Return standard deviations of the logarithm of loads, as in `finger_stiffness`,
+        """Return standard deviations of the logarithm of loads, see `finger_stiffness`,
         (count,)."""
         is_hand = np.array(loads or (1.0,) * count) > MAX_FINGER_LOAD
         return np.where(is_hand, HAND_STD, self.uncertainty.fingertip).astype(np.float32)

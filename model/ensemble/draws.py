@@ -153,10 +153,10 @@ def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
     """Return a percentile over the last axis, linear between values."""
     ordered = np.sort(values, axis=-1)
     last = ordered.shape[-1] - 1
-    place = percent / 100 * last
-    low = int(place)
+    rank = percent / 100 * last
+    low = int(rank)
     high = min(low + 1, last)
-    return np.asarray(ordered[..., low] + (place - low) * (ordered[..., high] - ordered[..., low]))
+    return np.asarray(ordered[..., low] + (rank - low) * (ordered[..., high] - ordered[..., low]))
 
 
 MAX_HELD = 0.0003
@@ -232,9 +232,9 @@ class ClockErrors:
         grown = np.expm1(np.minimum(variance, _MAX_VARIANCE))[:, :, None] * is_same
         return np.asarray(grown, dtype=np.float32)
 
-    def delays(self, by: Drawing) -> FloatArray:
+    def delays(self, drawing: Drawing) -> FloatArray:
         """Delay of each amplifier on drawn plates, (amplifiers, d) [s]."""
-        return self._delay_stds[:, None] * _numbers(by.seed, len(self.errors), by.count)
+        return self._delay_stds[:, None] * _numbers(drawing.seed, len(self.errors), drawing.count)
 
     @property
     def _delay_stds(self) -> FloatArray:
@@ -252,13 +252,13 @@ def _numbers(seed: int, amplifiers: int, count: int) -> FloatArray:
 
 
 def delayed(
-    gains: Complex64Array, clocks: ClockErrors, by: Drawing, omega: FloatArray
+    gains: Complex64Array, clocks: ClockErrors, drawing: Drawing, omega: FloatArray
 ) -> Complex64Array:
     """Return gains (f, a, d) on drawn plates with delays, from gains (a, d) without.
 
     omega (f,) [rad/s]. Of the a attachments and fingers the ERAs come first.
     """
-    factors = np.exp(-1j * omega[:, None, None] * clocks.delays(by))
+    factors = np.exp(-1j * omega[:, None, None] * clocks.delays(drawing))
     delayed_gains = np.repeat(gains[None], len(omega), axis=0)
     own = [*clocks.amplifier]
     era_count = len(own)

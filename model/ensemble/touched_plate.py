@@ -5,7 +5,7 @@ k fingers of dynamic stiffness D at centers c change fields X of a plate on its 
     X - G D P X_c,  P = (1 + G_cc D)^-1,
 
 where G is the displacement due to a force at each finger without the others. With the others, the
-acceleration is -w² G P^T. Symbols are as in `attached_plate`; a case is a frequency and a
+acceleration is -w² G P^T. `attached_plate` defines the symbols; a case is a frequency and a
 thickness. The expected power of weights w at a fingertip is w^H R w to first order,
 
     R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },

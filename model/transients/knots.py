@@ -327,7 +327,7 @@ def bounded_minimum(
 
     form: positive semidefinite, over knots and combinations; right (k, c); combinations (eras, c):
     orthonormal. Returns knots (k, eras): the unbounded solution if it is within the bounds, else
-    that of alternating directions (ADMM: Boyd and others, 2011, section 5), always within them.
+    a solution within them by alternating directions (ADMM: Boyd and others, 2011, section 5).
     """
     unit = np.eye(len(form))
     size = float(form.diagonal().real.mean())

@@ -35,7 +35,7 @@ class Reach:
     least_db_sl: FloatArray
     """Least level over the plate (f,)."""
     shares: FloatArray
-    """Share (f,) of the places that reach STRONG_DB_SL."""
+    """Share (f,) of the positions that reach STRONG_DB_SL."""
 
     @property
     def start(self) -> float | None:

@@ -223,7 +223,7 @@ class Shaper:
 
         gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`); fingertips: reads
         shapes under fingertips, None to read them point by point; magnets: of its exciters, None
-        for those of the plate as modeled.
+        for the magnets of the modeled plate.
         """
         self._plate = plate
         self._read_fingertips = fingertips or partial(_fingertips_on, plate)

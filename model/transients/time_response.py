@@ -255,7 +255,7 @@ class PlateInTime:
 
     @cached_property
     def half(self) -> NDArray[np.intp]:
-        """Indices (m,) of one eigenvalue per conjugate pair and of the real ones.
+        """Indices (m,) of one eigenvalue per conjugate pair, and of real eigenvalues.
 
         Ordered from the slowest to the fastest decay.
         """
@@ -360,7 +360,7 @@ def from_rest(
 
     signals (eras, n) in full strokes, sampled at sample_rate [Hz]; shapes (p, r) of the reduced
     plate at points; factors (eras,): gain and phase of each ERA. Displacement and velocity of the
-    plate are 0 at time 0; as with a ramp of 0, a base that jumps there passes on no impulse.
+    plate are 0 at time 0: a base that jumps there passes on no impulse, like a ramp of 0.
     """
     count = signals.shape[1]
     continued = _continued(signals)

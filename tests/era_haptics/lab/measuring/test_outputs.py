@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from era_haptics.lab.cli import app as cli_app
 from era_haptics.lab.measuring.desk import Desk
-from era_haptics.lab.measuring.outputs import OutputFinding, listen_to_outputs, matched, tone
+from era_haptics.lab.measuring.output_matching import OutputFinding, matched
+from era_haptics.lab.measuring.outputs import listen_to_outputs, tone
 from era_haptics.lab.measuring.sensor_file import WiredSensor
 from kit.desk_plate import Converters, DeskPlate, Truth
 from kit.plates import exciter_rig

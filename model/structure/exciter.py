@@ -1,17 +1,17 @@
 """Exciters: a voice coil on the plate, and a magnet on a suspension behind it.
 
-The coil, of mass m_c, moves with the plate, w; the magnet, of mass M, is free at x, or held by a
-frame. Between them are the suspension, k and c, and the force Bl i of the current. A voltage
-amplifier drives it through Z = R_e + R_g + i omega L, R_g its own output resistance: i = (V - i
-omega Bl (w - x)) / Z. With
+The coil, of mass m_c, moves with the plate, w; the magnet, of mass M, is free at x, or a frame
+holds it (`held`). Between them are the suspension, k and c, and the force Bl i of the current. A
+voltage amplifier with the output resistance R_g drives the current i = (V - i omega Bl (w - x)) / Z
+through Z = R_e + R_g + i omega L. With
 
     S = k + i omega (c + Bl² / Z),    T = omega² M / (omega² M - S), 1 if the magnet is held,
 
 the force on a clamped plate is F = T Bl V / Z, and the dynamic stiffness is D = S T - omega² m_c.
 Far below the resonance of the magnet, omega_m² = k / M, the force falls as omega²; above it, it is
 nearly the same at every frequency. A data sheet usually states the resonance of the light coil
-against the magnet, `free`. When glued to a plate the magnet moves, at f_m = f_s sqrt(m_s / M), m_s
-the moving mass in the data sheet.
+against the magnet, f_s (`free`). On a plate, the magnet moves against the coil; its resonance is
+f_m = f_s sqrt(m_s / M), with the moving mass m_s of the data sheet.
 
 Known types are in model/data/exciters.toml, with the source of each value.
 
@@ -32,7 +32,7 @@ from model.structure.attachments import InTime, PointLoad
 from model.structure.material import read_catalog
 from model.structure.sources import Era, Factor, Source
 
-_MAX_LAG = 0.1
+_MAX_LAG = 0.1  # Bl² L / R², relative to the mass of the magnet
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Exciter(Source):
     """Whether a frame holds the magnet."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
+        """Reject values out of range."""
         expect_values(
             self,
             f"exciter {self.name}",
@@ -70,7 +70,8 @@ class Exciter(Source):
         )
         super().__post_init__()
         if self.force_factor > self.largest_force_factor(self.magnet_mass):
-            lag, allowed = -self.in_time.inertance, _MAX_LAG * self.magnet_mass
+            lag = -self.in_time.inertance
+            allowed = _MAX_LAG * self.magnet_mass
             raise InputError(
                 f"inductance of exciter {self.name} must let the current follow its back EMF, "
                 f"Bl² L / R² at most {_MAX_LAG:g} of the magnet's mass, {1e3 * allowed:.3g} g, got "
@@ -95,27 +96,26 @@ class Exciter(Source):
 
     @property
     def magnet_frequency(self) -> float:
-        """Resonance of the magnet on the coil that is held, f_m [Hz]."""
+        """Resonance f_m [Hz] of the magnet with the coil at rest."""
         return math.sqrt(self.stiffness / self.magnet_mass) / (2 * math.pi)
 
     @property
     def support(self) -> PointLoad:
-        """Static equivalent: its weight, and a spring if it is held."""
+        """Static equivalent: its mass, and a spring if a frame holds the magnet."""
+        load = PointLoad(self.x, self.y, mass=self.coil_mass, foot=self.foot)
         if self.held:
-            return PointLoad(
-                self.x, self.y, self.stiffness, self.damping, self.coil_mass, self.foot
-            )
-        return PointLoad(self.x, self.y, mass=self.coil_mass + self.magnet_mass, foot=self.foot)
+            return replace(load, stiffness=self.stiffness, damping=self.damping)
+        return replace(load, mass=self.coil_mass + self.magnet_mass)
 
     @property
     def in_time(self) -> InTime:
-        """Equations in the time domain, for a current that follows u - L u' / R without delay, R =
-        R_e + R_g.
+        """Its equations in time, with the current (u - L u' / R) / R, R = R_e + R_g.
 
         u is the voltage less the back EMF. Force and damping are within (omega L / R)² of the exact
-        ones, 0.5 % at 500 Hz of a common coil.
+        values: within 0.5 % at 500 Hz for a typical coil.
         """
-        total, delay = self.loop_resistance, self.inductance / self.loop_resistance
+        total = self.loop_resistance
+        delay = self.inductance / total
         return InTime(
             mass=self.coil_mass,
             stiffness=self.stiffness,
@@ -127,7 +127,7 @@ class Exciter(Source):
         )
 
     def force(self, omega: FloatArray) -> ComplexArray:
-        """F = T Bl V / Z at full level on a plate that is held [N], its own gain included."""
+        """F = T Bl V / Z at full level on a plate at rest [N], its own gain included."""
         w = np.asarray(omega)
         return self._share(w) * self._pull(w)
 
@@ -142,10 +142,10 @@ class Exciter(Source):
         return spring * share - w**2 * self.coil_mass, np.asarray(by_voltage)
 
     def base(self, omega: FloatArray) -> ComplexArray:
-        """Motion Bl V / (Z omega² M) at full level, with which spring errors change the force.
+        """Motion Bl V / (Z omega² M) [m] at full level, by which spring errors change the force.
 
-        A spring that is stiffer by dS acts with dS T² (base - w) [m]; 0 for a held magnet, whose
-        spring is at rest.
+        A spring that is stiffer by dS adds the force dS T² (base - w). 0 if a frame holds the
+        magnet.
         """
         w = np.asarray(omega)
         if self.held:
@@ -154,7 +154,7 @@ class Exciter(Source):
 
     @property
     def quality(self) -> float:
-        """Q = sqrt(k M) / (c + Bl² / R) of the magnet on the coil that is held, driven."""
+        """Q = sqrt(k M) / (c + Bl² / R) of the magnet, with the coil at rest and driven."""
         return math.sqrt(self.stiffness * self.magnet_mass) / self.in_time.damping
 
     @property
@@ -164,19 +164,21 @@ class Exciter(Source):
 
     @property
     def largest_force(self) -> float:
-        """Force Bl V / R [N] at full level, gain included, well above f_m, without L."""
+        """Force Bl V / R [N] at full level, gain included, far above f_m and without L."""
         return self.in_time.by_drive * self.voltage * self.largest_gain
 
     def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
-        """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
+        """Motion T w [m] of the coil in the magnet, for the plate's motion w (f, ...) [m].
+
+        omega (f,) [rad/s].
+        """
         share = self._share(np.asarray(omega))
         return share.reshape(-1, *[1] * (moved.ndim - 1)) * moved
 
     def loosened(self, share: float) -> Self:
-        """Return an exciter with a fraction of its dynamic stiffness, because of its glue, and less
-        force.
+        """Return the exciter with a share of its dynamic stiffness, because of its glue.
 
-        The force decreases with the square root of the fraction, and as much again in a gain.
+        The force decreases with the square root of the share.
         """
         return replace(
             self.varied(stiffness=share, damping=share),
@@ -192,24 +194,28 @@ class Exciter(Source):
         return names | {"bolt_mass": "coil_mass"}
 
     def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
-        """Changes of D and of the force: dS makes T² dS and T² dS base, as that is defined.
+        """Derivatives of D and of the force.
 
-        A heavier magnet moves less, dT = T (1 - T) dM / M.
+        A change dS changes D by T² dS and the force by T² dS `base`. A heavier magnet moves less:
+        dT = T (1 - T) dM / M.
         """
-        w, share, force = np.asarray(omega), self._share(omega), self.force(omega)
-        base, still = self.base(w), np.asarray(1 - share)
-        electric = 2j * w * self.force_factor**2 / self._impedance(w)
+        w = np.asarray(omega)
+        share = self._share(w)
+        force = self.force(w)
+        base = self.base(w)
 
         def by_spring(change: ComplexArray | float) -> tuple[ComplexArray, ComplexArray]:
             stiffness_change = share**2 * change
             return np.asarray(stiffness_change), stiffness_change * base
 
-        by_factor, of_force = by_spring(electric)
+        electric = 2j * w * self.force_factor**2 / self._impedance(w)
+        by_electric, force_by_electric = by_spring(electric)
+        by_mass = 1 - share
         return {
             "stiffness": by_spring(self.stiffness),
             "damping": by_spring(np.asarray(1j * w)),
-            "force_factor": (by_factor, np.asarray(of_force + force)),
-            "magnet_mass": (np.asarray(self._spring(w) * share * still), np.asarray(force * still)),
+            "force_factor": (by_electric, force_by_electric + force),
+            "magnet_mass": (self._spring(w) * share * by_mass, np.asarray(force * by_mass)),
             "bolt_mass": (np.asarray(-(w**2) + 0j), np.zeros(w.shape, dtype=complex)),
         }
 
@@ -220,19 +226,21 @@ class Exciter(Source):
     def _spring(
         self, w: FloatArray, stiffness: Factor = 1.0, damping: Factor = 1.0
     ) -> ComplexArray:
-        """S [N/m], of a suspension that is stiffer and damps more by factors."""
-        lost = damping * self.damping + self.force_factor**2 / self._impedance(w)
-        return stiffness * self.stiffness + 1j * w * lost
+        """S [N/m], with stiffness and damping of the suspension multiplied by factors."""
+        resistance = damping * self.damping + self.force_factor**2 / self._impedance(w)
+        return stiffness * self.stiffness + 1j * w * resistance
 
     def _share(self, w: FloatArray, spring: ComplexArray | None = None) -> ComplexArray:
-        """T, for S [N/m] if given, else its own."""
+        """T; spring: S [N/m] if it differs from the exciter's own."""
         if self.held:
             return np.ones(w.shape, dtype=complex)
+        if spring is None:
+            spring = self._spring(w)
         inertia = w**2 * self.magnet_mass
-        return inertia / (inertia - (self._spring(w) if spring is None else spring))
+        return inertia / (inertia - spring)
 
     def _pull(self, w: FloatArray) -> ComplexArray:
-        """Force of the current of a coil that is held [N], at full level."""
+        """Force Bl V / Z [N] of the current at full level, with the coil at rest."""
         drive = self.voltage * self.gain(w / (2 * np.pi))
         return self.force_factor / self._impedance(w) * drive
 

@@ -47,12 +47,12 @@ MAX_DEVIATING = 64
 """Number of lowest elastic modes that can differ from a file's modes."""
 
 RIGID_FREQUENCY = 1.0  # Hz; below it a mode is of the rigid body
-_HELD = 0.2  # normal motion of a rigid mode, relative to the mode with the most
-_SEEN = 1e-3  # the same of elastic modes, to their median; others move within the surface
-_TILTING = 3  # rigid modes of a surface that is free: it moves along the normal and tilts
-_FEWEST = 6  # nodes, and elastic modes
-_BESIDE = 9  # neighboring nodes that define the plane for a normal
-_ON_OUTLINE = 1e-3  # m; a place so near to it is on the surface
+_ALONG_NORMAL = 0.2  # normal motion of a rigid mode, relative to the mode with the most
+_SEEN = 1e-3  # normal motion of an elastic mode, relative to the median; others are in-plane
+_TILTING = 3  # rigid modes of a free surface, which moves along the normal and tilts
+_FEWEST = 6  # minimum number of nodes, and of elastic modes
+_NEIGHBORS = 9  # nodes that define the plane for a normal
+_ON_OUTLINE = 1e-3  # m; a point within this distance of the outline is on the surface
 _SAME_MASS = 0.1
 _SAME_LOSS = 0.01
 
@@ -188,16 +188,17 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
     read = read_modes(Path(file), content)
     axis = "xyz".index(normal[-1])
     upwards = -1.0 if "-" in normal else 1.0
-    along = (read.shapes if read.shapes.ndim == 2 else upwards * read.shapes[:, :, axis]).T
-    w = along
+    along_axis = (read.shapes if read.shapes.ndim == 2 else upwards * read.shapes[:, :, axis]).T
+    w = along_axis
     normals = upwards * np.eye(3)[[axis] * len(read.nodes)]
     if normal.startswith("local") and read.shapes.ndim == 3:
         normals = upwards * _normals(read.nodes, axis)
         w = np.einsum("rnk,nk->nr", read.shapes, normals)
     order = np.argsort(read.frequencies, kind="stable")
-    frequencies, w, along = read.frequencies[order], w[:, order], along[:, order]
+    frequencies = read.frequencies[order]
+    w = w[:, order]
     is_rigid = frequencies < RIGID_FREQUENCY
-    elastic, ratios = w[:, ~is_rigid], read.damping_ratios[order][~is_rigid]
+    elastic = w[:, ~is_rigid]
     size = np.sqrt((elastic**2).mean(axis=0))
     is_seen = size > _SEEN * np.median(size) if len(size) else np.empty(0, dtype=bool)
     if is_seen.sum() < _FEWEST or len(w) < _FEWEST:
@@ -206,41 +207,40 @@ def surface_shapes(file: str, digest: str, normal: str) -> SurfaceShapes:
             f"{_FEWEST} nodes or more, got {is_seen.sum()} at {len(w)}; export more, or give "
             "surface.normal"
         )
-    # Mixtures of rigid motions that go along the normal; nothing would hold the others.
-    _, sizes, mixtures = np.linalg.svd(w[:, is_rigid], full_matrices=False)
-    held = sizes > _HELD * sizes.max(initial=0.0)
-    rigid, in_plane = int(held.sum()), [a for a in range(3) if a != axis]
-    places = read.nodes[:, in_plane] if read.places is None else read.places
+    # Combinations of rigid motions along the normal; no attachment would hold the others.
+    _, sizes, combinations = np.linalg.svd(w[:, is_rigid], full_matrices=False)
+    along_normal = combinations[sizes > _ALONG_NORMAL * sizes.max(initial=0.0)]
+    rigid = len(along_normal)
+    places = np.delete(read.nodes, axis, axis=1) if read.places is None else read.places
     points = places - places.min(axis=0)
     if not np.ptp(points, axis=0).all():
         raise InputError(
             f"{file}: nodes must extend along both axes across {normal}, got a line; set "
             "surface.normal to the axis out of the surface"
         )
+    elastic_frequencies = frequencies[~is_rigid][is_seen]
+    elastic_ratios = read.damping_ratios[order][~is_rigid][is_seen]
     return SurfaceShapes(
-        points,
-        np.concatenate([np.zeros(rigid), frequencies[~is_rigid][is_seen]]),
-        np.hstack([w[:, is_rigid] @ mixtures[held].T, elastic[:, is_seen]]),
-        np.concatenate([np.full(rigid, math.nan), ratios[is_seen]]),
-        rigid,
-        _mass(along[:, is_rigid]),
-        np.ptp(points, axis=0),
-        rings_of(read.faces, points),
-        _rigid_motions(read.nodes, normals, axis),
-        read,
+        points=points,
+        frequencies=np.concatenate([np.zeros(rigid), elastic_frequencies]),
+        shapes=np.hstack([w[:, is_rigid] @ along_normal.T, elastic[:, is_seen]]),
+        damping_ratios=np.concatenate([np.full(rigid, math.nan), elastic_ratios]),
+        rigid=rigid,
+        mass=_mass(along_axis[:, order][:, is_rigid]),
+        size=np.ptp(points, axis=0),
+        outline=rings_of(read.faces, points),
+        motions=_rigid_motions(read.nodes, normals, axis),
+        modes=read,
     )
 
 
 def _rigid_motions(nodes: FloatArray, normals: FloatArray, axis: int) -> FloatArray:
     """Motion along normals (n, 3) by a translation along an axis and rotations about the others."""
-    translation = normals[:, axis]
     arms = nodes - nodes.mean(axis=0)
-    rotations = [
-        (np.cross(direction, arms) * normals).sum(axis=1)
-        for number, direction in enumerate(np.eye(3))
-        if number != axis
-    ]
-    return np.column_stack([translation, *rotations])
+    motions = [normals[:, axis]]
+    for direction in np.delete(np.eye(3), axis, axis=0):
+        motions.append((np.cross(direction, arms) * normals).sum(axis=1))
+    return np.column_stack(motions)
 
 
 def evenly_spaced(points: FloatArray, count: int) -> FloatArray:
@@ -261,9 +261,9 @@ def _normals(nodes: FloatArray, axis: int) -> FloatArray:
     an axis."""
     from scipy.spatial import cKDTree  # only curved surfaces need it
 
-    _, near = cKDTree(nodes).query(nodes, k=min(_BESIDE, len(nodes)))
-    beside = nodes[near] - nodes[near].mean(axis=1, keepdims=True)
-    normals = np.linalg.svd(beside)[2][:, 2]
+    _, near = cKDTree(nodes).query(nodes, k=min(_NEIGHBORS, len(nodes)))
+    neighbors = nodes[near] - nodes[near].mean(axis=1, keepdims=True)
+    normals = np.linalg.svd(neighbors)[2][:, 2]
     return normals * np.where(normals[:, [axis]] < 0, -1.0, 1.0)
 
 

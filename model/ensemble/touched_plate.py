@@ -12,11 +12,11 @@ thickness. The expected power of weights w at a fingertip is w^H R w to first or
 
 with h the field of each ERA, t_pj the acceleration due to a force at attachment j, and r_j the
 deformation of that attachment due to each ERA at full stroke. Each change d is for one standard
-deviation; s_j is the standard deviation of the stiffness. The ERAs' damping c changes for all
-together; the stiffness of each ERA and foot and the load of each finger j change on their own, as
-do gains, by sigma. These are exact derivatives of the loaded plate, except for the local deflection
-under a finger. The thickness counts by half the sum of dh* dh^T of the plates thicker and thinner
-by one standard deviation, solved exactly; the modulus is included there (`attached_plate`). The
+deviation; s_j is the standard deviation of the stiffness. The damping c is common to all ERAs. The
+stiffness of each ERA and foot, the load of each finger j, and the gains (by sigma) change
+independently. These are exact derivatives of the loaded plate, except for the local deflection
+under a finger. For the thickness, the term is half the sum of dh* dh^T for the plates thicker and
+thinner by one standard deviation, solved exactly; it includes the modulus (`attached_plate`). The
 effect of the loss factor is negligible.
 
 `model.ensemble.kernel_plates` has the same computation in C, and puts fingers on a plate with the
@@ -435,7 +435,7 @@ class TouchedPlate:
         """Mean square of second harmonics over k fingertips [m²/s⁴], (m, k, 1 + d).
 
         For a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; other
-        arguments: see `drawn`. The nominal plate has none.
+        arguments: see `drawn`. Zero for the nominal plate.
         """
         plate = self.plate_on_eras.plate
         plates = DrawnPlates.of(self.plate_on_eras, len(shares), drawing)

@@ -182,7 +182,7 @@ def fit(
     - searched (p,): mask of the parameters to find; default: all uncertain ones.
     - start (p,): start values, and values of all fixed parameters; default: zero.
     - prior: used instead of the prior of the space.
-    - soft: number of standard errors above which a residual counts by its magnitude, not its
+    - soft: number of standard errors above which the magnitude of a residual counts, not the
       square.
     - evaluations: maximum number of model evaluations.
     """

@@ -58,7 +58,7 @@ SENSOR_FOOT = 5e-3
 """Radius of the disc on which a sensor's mass acts [m]; a plate is soft under a point."""
 
 MIN_LOSS_FACTOR = 1e-9
-"""Minimum loss factor, so that derivatives by its logarithm exist."""
+"""Minimum loss factor, so that its logarithm has derivatives."""
 
 
 @dataclass(frozen=True)

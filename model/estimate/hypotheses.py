@@ -31,14 +31,14 @@ _LOSSES = (0.1, 0.3, 3.0, 10.0, 30.0)
 _BOLTS = (0.01, 0.02, 0.04, 0.08, 0.16)  # added mass of each bolt, relative to the plate's mass
 
 _MAX_LOSS_FACTOR = 0.9
-"""Largest loss factor that is tried; a larger one explains no plate."""
+"""Maximum loss factor of a hypothesis; no plate has more."""
 
 _BEYOND_RANGE = 1.5
-"""Factor by which the search for the best factor goes beyond the ends of a range."""
+"""Extension of the search for the best factor beyond the ends of a range, a factor."""
 
 _MIN_SCALED_FREQUENCY = 0.85
-"""Minimum ratio of natural frequencies to those of the solved plate for scaling its solution, whose
-modes then still reach well beyond the tones."""
+"""Minimum ratio of natural frequencies to the solved plate's for scaling its solution. Its modes
+then still extend well beyond the tones."""
 
 FITTED_HYPOTHESES = 5
 """Number of variations for which the rest of the rig is fitted, in order of their misfit."""

@@ -3,7 +3,7 @@
     d_fsn ~ m_fn exp(i phi_fn) a_fsn(x) + noise,   m_fn near G_n
 
 d are measured values, a the model's values, G_n the gain of a channel. Magnitudes m vary about G_n
-with frequency, as in real actuators. Phases phi are free, because a measurement can lack them. Both
+with frequency, like in real actuators. Phases phi are free: a measurement can lack them. Both
 follow from x and G, so that only x and G are searched (`model.estimate.fit`). Priors hold x near
 the rig's values: a large difference is evidence against the rig.
 
@@ -54,7 +54,7 @@ _GAIN_STD = 0.08
 """Standard deviation of a gain's magnitude over frequency, relative."""
 
 _SOFT = 2.0
-"""Number of standard errors above which a residual counts by its magnitude."""
+"""Number of standard errors above which the magnitude of a residual counts, not the square."""
 
 _MAX_OUTLIERS = 0.05
 """Largest share of outliers among all values.

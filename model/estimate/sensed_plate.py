@@ -169,7 +169,8 @@ class SensedPlate(ForwardModel):
     def largest_errors(self) -> FloatArray:
         """Standard errors of x (n,) above which a fitted value is not identified.
 
-        Infinite for an exciter's coil and magnet, given by its data sheet. Feet have a prior, too.
+        Infinite for an exciter's coil and magnet, whose values are from a data sheet. Feet have a
+        prior, too.
         """
         limits = []
         for parameter in self.parameters:

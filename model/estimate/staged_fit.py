@@ -195,7 +195,7 @@ def _fits_with_mass(
 ) -> list[RigFit]:
     """Fit positions and an additional mass, from several positions and without it; best first.
 
-    number: index of the mass. The positions are those where it would explain most.
+    number: index of the mass. Positions are chosen where a mass would explain most.
     """
     space = model.space
     start = inwards(space, x, by=_INWARDS)

@@ -29,7 +29,7 @@ _STEP = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class AttachmentPoints:
-    """Shapes at `a` points of attachment and observation, v of them movable along x and y."""
+    """Shapes at `a` points of attachment and observation; v points can move along x and y."""
 
     footprints: FloatArray
     """Position and radius of each (a, 3) [m]."""

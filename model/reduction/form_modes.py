@@ -24,7 +24,7 @@ from model.structure.modal_elasticity import Dispersion, check_is_plate
 
 @dataclass(frozen=True, eq=False)
 class ReducedModes:
-    """Modes and residual vectors at all attachments of a plate, in which it can have form errors.
+    """Modes and residual vectors at all attachments of a plate that can have form errors.
 
     No further modes count as truncated.
     """

@@ -7,7 +7,7 @@ with polynomials all modes of the deflection are known, and the truncated ones a
 Solutions for points are then a low-rank correction (`model.structure.attachments`): per frequency,
 a system with as many unknowns as points, independent of the mesh.
 
-Receptance. Modes and truncated modes of one solution serve for every modulus, thickness and loss
+Receptance. Modes and truncated modes of a solution are valid for any modulus, thickness and loss
 factor: with q = (1 + i eta) E h² / (E h²)_solved, z = w² / q and modal masses that grow as h,
 
     h A = sum phi phi' g + sum T_j c_j,   g = 1 / (q lambda - w²),   c = weights(z + shift) / q,
@@ -376,9 +376,9 @@ def combined(functions: ComplexArray, products: FloatArray) -> ComplexArray:
 class FreeReceptance:
     """Factors of shapes and sums at frequencies (f,), for plates of a given stiffness and mass.
 
-    omega (f,) [rad/s]; with any number of cases in front of them: thickness (...), relative to the
-    solved one, q (..., f): see above, elastic (..., f, r): E lambda of each mode [rad²/s²] relative
-    to the modulus solved, losses included; shift, largest: of the truncated sums.
+    omega (f,) [rad/s]. For any number of cases (leading axes): thickness (...), relative to the
+    solved thickness, q (..., f): see above, elastic (..., f, r): E lambda of each mode [rad²/s²]
+    relative to the solved modulus, losses included; shift, largest: of the truncated sums.
     """
 
     omega: FloatArray
@@ -542,7 +542,7 @@ class FreePlate:
         limit = omega.max(initial=0.0) / math.sqrt(lowest_truncated)
         if not thinnest > limit:
             raise InputError(
-                f"thickness must be above {limit:.3g} times that of the solved plate at "
+                f"thickness must be above {limit:.3g} times the solved thickness at "
                 f"{omega.max() / (2 * math.pi):g} Hz, got {thinnest:g}; solve that plate"
             )
 

@@ -39,11 +39,11 @@ from model.structure.modal_elasticity import Dispersion, ModalElasticity
 from model.structure.plate import Plate
 
 RESIDUAL_VECTORS = 3
-"""Residual vectors for each attachment."""
+"""Number of residual vectors for each attachment."""
 
 _DEPENDENT = 1e-9
 """Share of the largest squared norm below which a combination of residual vectors is dropped: they
-are linearly dependent, as at two attachments of one position."""
+are linearly dependent, for example at two attachments with equal positions."""
 
 _MIN_SHIFTED = 0.99
 """Lowest eigenvalue of K + shift M that is kept, relative to the lowest truncated mode's. The local

@@ -18,16 +18,16 @@ plate *on its ERAs*,
     C_s,jk = psi_j' (eta diag(omega²) + losses) psi_k / sqrt(omega_j omega_k),
 
 where eta is the geometric mean of its values at omega_j and omega_k if it varies with frequency,
-and losses are those of soft layers, of air and of support springs with a loss factor. C_s is
+and losses belong to soft layers, air, and support springs with a loss factor. C_s is
 positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
 of the hysteretic plate; a damping ratio of eta/2 in the modes of the *free* plate would not,
 because the energy in the springs has no loss. Contacts do not change C_s. Both plates differ off
 resonance: with eta = 1 % the steady accelerations of the paper's plate differ by at most 0.5 %
 (relative L2 over the plate, 40 to 500 Hz), in proportion to eta.
 
-Damping ratios. That of a mode psi with modal mass 1 is psi' C psi / (2 omega). It includes the
-plate's own losses and the ERAs' dampers, but neglects that dampers couple the modes; the time
-domain includes that.
+Damping ratios. The damping ratio of a mode psi with modal mass 1 is psi' C psi / (2 omega). It
+includes the plate's losses and the ERAs' dampers, but neglects the coupling of modes by dampers,
+which the time domain includes.
 """
 
 from collections.abc import Sequence
@@ -76,8 +76,8 @@ def modal_matrices(
 ) -> MotionMatrices:
     """Return M, C, K (r + m + n, ...) of the plate on its ERAs with its loads and n fingertips.
 
-    The plate's coordinates are followed by those of m far ends of the sources, and of the phalanges
-    in the order of contacts. attachment_shapes: shapes at the ERAs, loads and contacts, if already
+    The coordinates belong to the plate, then to m far ends of the sources, then to the phalanges in
+    the order of contacts. attachment_shapes: shapes at the ERAs, loads and contacts, if already
     known. Raises InputError for ERAs and loads that do not support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)

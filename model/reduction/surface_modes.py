@@ -7,10 +7,10 @@ without which a reduced plate (`model.reduction.reduced_plate`) could not repres
     T_j(p, q) = n f u^j sqrt(m(p) m(q)) c_j(k |p - q|) / (2j - 1),   u = 1 / (4 pi² f²),
     c_j(r) = (4j - 2) int_1^inf J0(r x) / x^(4j - 1) dx,   j = 1, 2, ...
 
-with n modes per Hz and the frequency f up to which as many are expected, both of the straight line
-through the natural frequencies by their number, m their mean square at a point and k their
-wavenumber. A homogeneous plate with these modes has this compliance. Residual vectors that a
-program exports as modes are truncated modes like any others.
+with n modes per Hz, the frequency f up to which the known modes are expected (both from the
+straight line through natural frequencies over mode numbers), the mean square m of the modes at a
+point, and their wavenumber k. A homogeneous plate with these modes has this compliance. Residual
+vectors that a program exports as modes are treated as truncated modes.
 
 The estimate is a mean. The compliance of a given surface depends on its next modes: for Gaussian
 shapes its relative deviation is sqrt(2 / 3N) with N known modes, at each position and in each
@@ -106,7 +106,7 @@ class SurfaceModes:
         elastic = frequencies[exported.rigid :]
         half = len(elastic) // 2
         self._upper = slice(exported.rigid + half, len(frequencies))
-        # The straight line through frequencies by number: expected spacing, and where it would end.
+        # Straight line through frequencies over numbers: expected spacing and highest frequency.
         numbers = np.arange(half, len(elastic)) + 0.5
         slope, start = np.polyfit(numbers, elastic[half:], 1)
         self._spacing = max(float(slope), 1e-6 * highest)

@@ -4,12 +4,13 @@ The direct solution is the reference for the modal one, without approximation in
 Adhesives, air and in-plane inertia have their values at each frequency, and the compliance that
 polynomials do not resolve is added.
 
-Derivatives are those of the stiffness between given shapes with respect to the plate's sides and
-Poisson's ratios. Displacements along the plate follow deflections by least energy: a change of
-stiffness dK then changes the energy of shapes v by v^T dK v, to first order without a solve of
-another plate. By a side it has a closed form (`class_stiffness`); by Poisson's ratio nu, which
-changes alike in all layers, it follows from a small change of the section, in which K is linear.
-The stiffness that air adds, and changes of rotary inertia, are left out.
+Derivatives are the changes of the stiffness between given shapes with the plate's sides and
+Poisson's ratios. Displacements along the plate minimize the energy for a given deflection. To first
+order, a change of stiffness dK therefore changes the energy of shapes v by v^T dK v, and no other
+plate is solved. The derivative with respect to a side has a closed form (`class_stiffness`). The
+derivative with respect to Poisson's ratio nu, whose change is the same in all layers, follows from
+a small change of the section, because K is linear in the section. The stiffness of air and changes
+of rotary inertia are neglected.
 """
 
 import math

@@ -213,7 +213,7 @@ class SpectralPlate:
 
 
 class _ModalSpace:
-    """Space of the lowest modes of three real plates, in which complex modes are solved for."""
+    """Space of the lowest modes of three real plates, for solving complex modes."""
 
     def __init__(
         self,

@@ -1,11 +1,11 @@
 """Basis functions of x and y over a plate, and its matrices, one symmetry class at a time.
 
-Functions of one direction are Legendre polynomials and boundary layers of a free edge, all of them
-even or odd about the middle. Displacements along a free edge twist the layers of a plate against
-each other in boundary layers exp(-k x), which polynomials resolve only at very high degree: in one
-homogeneous layer the rotations of Reissner and Mindlin have one as wide as it is thick, k =
-sqrt(10) / h. So there is one more function for each, exp(-k x) +- exp(-k (L - x)). Integrals are by
-Gauss's rule on pieces that shrink towards the edges.
+Functions of a direction are Legendre polynomials and boundary layers of a free edge, even or odd
+about the middle. Displacements along a free edge twist the layers of a plate against each other in
+boundary layers exp(-k x), which polynomials resolve only at very high degree. In a homogeneous
+layer, the rotations of Reissner and Mindlin have a boundary layer as wide as the thickness, k =
+sqrt(10) / h. Each boundary layer has an additional function exp(-k x) +- exp(-k (L - x)). Integrals
+are computed by Gauss's rule on pieces that shrink toward the edges.
 
 Unknowns of a symmetry class are the deflection w, in polynomials, and the displacements along the
 plate u_x and u_y of every interface between the layers, with boundary layers. u_x has the other
@@ -214,7 +214,7 @@ def edge_decays(section: CrossSection, along: int) -> tuple[float, ...]:
 class ClassFunctions:
     """Functions along x and y of a symmetry class, for a number of interfaces.
 
-    of_w, of_x, of_y: numbers of functions along x and y of w and of one interface's u_x and u_y.
+    of_w, of_x, of_y: numbers of functions along x and y for w, and for u_x and u_y of an interface.
     """
 
     x: EdgedFunctions

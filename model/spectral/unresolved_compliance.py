@@ -49,7 +49,7 @@ from model.structure.plate import Plate
 _UNRESOLVED = 0.9
 _CURVATURE = 1  # the missing compliance oscillates as a polynomial this many degrees lower
 
-# Bending at a corner, times the infinite plate's: assumed as in shear, one plate and three images.
+# Bending at a corner, times the infinite plate's: as assumed for shear, a plate and three images.
 _CORNER = 4.0
 # Where a disc that is cut by an edge acts, from its center to the centroid of its part on the
 # plate: the middle, chosen for the accuracy of `test_response_on_feet_is_that_of_fine_elements`.
@@ -73,7 +73,7 @@ _LOG_WEIGHTS = math.log(100) / 2 * _WEIGHTS
 class UnresolvedCompliance:
     """Compliance under a force at n footprints [m] (n, 3), in bending and in shear [m/N] (n,).
 
-    bending and shear are those of a point. wavenumber [1/m] (n,): lower limit of unresolved waves;
+    bending and shear are valid for points. wavenumber [1/m] (n,): lower limit of unresolved waves;
     decade [m/N] (n,): shear compliance of ten times shorter waves.
     """
 

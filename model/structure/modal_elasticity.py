@@ -90,7 +90,7 @@ class ModalElasticity:
         losses: FloatArray,
         dispersion: Dispersion | None = None,
     ) -> Self:
-        """Return those of a plate with these theoretical values (r,), including all of its lowest
+        """Return the elasticity of a plate with these theoretical values (r,), including all lowest
         modes."""
         deviations = np.array(plate.mode_deviations, dtype=float).reshape(-1, 2)
         if not len(deviations):

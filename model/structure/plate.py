@@ -212,7 +212,7 @@ class AirGap:
 
     depth: float  # m
     closed: bool = False
-    """Whether it is sealed along all edges; otherwise it is open along all edges."""
+    """Whether the gap is sealed along all edges; otherwise it is open along all edges."""
 
     def __post_init__(self) -> None:
         """Reject a depth that is not above zero."""
@@ -263,9 +263,9 @@ def _scales(*, is_of_theory: bool = True, has_own_row: bool = False) -> dict[str
     moduli. A field without this metadata does not scale (`check_scales`), so a plate that has it
     must be solved for each thickness.
 
-    is_of_theory: whether the field decides the modes of the plate's theory. If not, a table of the
-    plate follows a change of it, and identified modes remain those of the changed plate.
-    has_own_row: whether a summary shows it in a row of its own, not among the further quantities.
+    is_of_theory: whether the theoretical modes of the plate depend on the field. If not, a table is
+    updated when the field changes, and identified modes remain valid.
+    has_own_row: whether a summary shows the field in a separate row, not among the quantities.
     """
     return {"scales": True, "is_of_theory": is_of_theory, "has_own_row": has_own_row}
 
@@ -299,9 +299,8 @@ class Plate(Sheet):
     mode_deviations: tuple[tuple[float, float], ...] = field(
         default=(), metadata=_scales(is_of_theory=False)
     )
-    """Logarithms of eigenvalue and loss factor of the lowest elastic modes, relative to those of
-    the theory, in ascending order, as `era rig identify` finds them (see
-    `model.structure.modal_elasticity`).
+    """Logarithms of eigenvalue and loss factor of the lowest elastic modes, relative to the theory,
+    in ascending order; found by `era rig identify` (see `model.structure.modal_elasticity`).
     """
 
     laminate: Laminate | None = field(default=None, metadata=_scales())

@@ -75,7 +75,7 @@ def static_loads(
 
 
 def center_of_mass(plate: Plate) -> Point:
-    """Return the center of mass [m] of the bare plate: its middle, or a surface's by its modes."""
+    """Return the center of mass [m] of a bare plate, or of a surface according to its modes."""
     if plate.surface is not None:
         center = center_of_surface(plate.surface)
         if center is not None:

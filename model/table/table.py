@@ -46,8 +46,8 @@ Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long.
 PAPER_GRID = Grid(12, 9)
 
 BACKGROUND_CELL = 0.0254
-"""Approximate side [m] of the cells at whose centers the power around targets is computed, the same
-as in the founding paper."""
+"""Approximate side [m] of the cells at whose centers the power around targets is computed, equal to
+the founding paper's."""
 
 CELLS_PER_WAVELENGTH = 4
 """Approximate minimum of cells for each bending wavelength."""

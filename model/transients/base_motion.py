@@ -89,7 +89,7 @@ def along_lines(
 class BaseMotions:
     """Sets of motions of all ERAs' bases, as arrays over their terms, ascending in omega.
 
-    number, era (n,): set and base of each term; start, end [s], omega [rad/s], c0, c1 (n,): as in
+    number, era (n,): set and base of each term; start, end [s], omega [rad/s], c0, c1 (n,): see
     `Term`, c1 None if all are 0.
     """
 

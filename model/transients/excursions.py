@@ -1,14 +1,14 @@
 """Excursions of exciter magnets, and the limits on drives that keep them within range.
 
 An onset moves a magnet further than the settled vibration: free vibration near its own resonance
-beats with the drive. A drive that rises or falls steadily, along whatever ramp, is a mean of drives
-that jump at different times, so it moves a magnet no further than a drive that jumps; shares of
-full level are computed for that (`MagnetMotions`). Levels that come and go are followed step by
-step (`Swing`): at the rate of the beat, 10 to 60 times a second, they pump the magnets' free
-vibration, since a side band is at their resonance. The eigenvectors near the drive are followed
-exactly, for straight lines between steps; those far above follow the level immediately. Shaped
-envelopes rise above their final amplitude; their difference from a plain ramp is scaled to what the
-magnets allow.
+beats with the drive. A drive that rises or falls monotonically is a mean of drives that jump at
+different times, so it moves a magnet no further than a drive that jumps. Shares of full level are
+computed for a jump (`MagnetMotions`). Repeated changes of level are simulated step by step
+(`Swing`): at the rate of the beat, 10 to 60 times a second, they pump the magnets' free vibration,
+because a side band is at their resonance. The eigenvectors near the drive are solved exactly, for
+straight lines between steps; eigenvectors at much higher frequencies follow the level immediately.
+Shaped envelopes rise above their final amplitude; their difference from a plain ramp is scaled to
+the magnets' limits.
 
 All of this holds for the nominal board. The additional motion on boards within the rig's tolerances
 is estimated from a few drawn boards, per frequency, so that 90 % stay within range.
@@ -73,8 +73,8 @@ class Excursions:
     passed: NDArray[np.bool_]
     """Whether these exceed the exciters' limits (n,)."""
     allowed: float
-    """Lowest frequency [Hz] above which all stay within the limits up to the highest; infinite if
-    there is none."""
+    """Lowest frequency [Hz] from which on all magnets stay within their limits; infinite without
+    such a frequency."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float
 
 @lru_cache(_SWINGS_KEPT)
 def _board_factors(magnets: MagnetMotions, frequencies: tuple[float, ...]) -> FloatArray:
-    """Return the factor by which magnets move further on 90 % of boards (f,), at least 1.
+    """Return factors (f,) on the motion of magnets that 90 % of boards do not exceed, at least 1.
 
     1 if jumps to full level are far within the excursion.
     """

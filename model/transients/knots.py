@@ -81,7 +81,7 @@ class Carrier:
 
 @dataclass(frozen=True, eq=False)
 class FingerResponses:
-    """Responses to some ERAs, as in `Carrier`, at t targets and at d rows of quiet fingers."""
+    """Responses to some ERAs (see `Carrier`) at t targets and at d rows of quiet fingers."""
 
     targets: int
     """t."""
@@ -226,7 +226,7 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
 def _summed(responses: _ComplexArray, gain_variance: float) -> _ComplexArray:
     """Return the expected form over knots and ERAs of squares, summed over samples, rows and steps.
 
-    responses (samples, d, knots, eras) as in `FingerResponses.hats`. In the step before the last,
+    responses (samples, d, knots, eras): see `FingerResponses.hats`. In the step before the last,
     each hat responds like the next knot's hat in the last step, and so on.
     """
     knots, eras = responses.shape[2:]

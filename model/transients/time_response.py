@@ -3,11 +3,11 @@
     M q'' + C q' + K q = sum over ERAs of phi (k_b y + c y')
 
 q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers on
-it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
-`model.reduction.supported_plate`. For exciters y is the voltage, k_b and c are the forces by it and
-by its rate that push plate and magnet apart, and q includes the displacements of their magnets. The
-first-order system is diagonalized once for each set of attachments. There are three kinds of
-drives, all without a step size, so that no error grows with time:
+it, phi the shapes at an ERA, and y the motion of the ERA's base. `model.reduction.supported_plate`
+defines M, C and K. For exciters, y is the voltage, k_b and c are the forces between plate and
+magnet due to y and y', and q includes the displacements of their magnets. The first-order system is
+diagonalized once for each set of attachments. There are three kinds of drives, all without a step
+size, so that no error grows with time:
 
 - Bases that move in terms with closed-form solutions (`model.transients.base_motion`):
   `PlateInTime.driven`.
@@ -405,8 +405,8 @@ _RESOLUTION, _LONG_BAND = 0.5, 80.0  # Hz; for long envelopes, the band to each 
 _GUARD = 12
 """Steps after the end that are computed and left out.
 
-Spectra are cut off, so the plate seems to ring before a jump at the start. That wraps around to the
-end, where it has grown most.
+Because spectra are cut off, the plate seems to ring before a jump at the start. This ringing wraps
+around to the end, where the errors are largest.
 """
 
 

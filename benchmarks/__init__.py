@@ -1,7 +1,7 @@
 """Benchmarks of contrast, promises, time and accuracy, each run as `python -m benchmarks.NAME`.
 
-Linear algebra has one thread in all of them: set here, before any of them loads numpy. Chains in
-virtual time and reference solvers are those of the tests.
+Linear algebra uses a single thread, which is set here before a benchmark loads numpy. Simulations
+in virtual time and reference solvers are shared with the tests.
 """
 
 import os

@@ -1,9 +1,9 @@
-"""The curved glass of examples/calculix by the equations of CalculiX, with ERAs and fingers on it.
+"""The curved glass of examples/calculix with ERAs and fingers, solved with CalculiX's equations.
 
 CalculiX stores its stiffness and mass (SOLVER=MATRIXSTORAGE). At each frequency the whole system is
-factorized; forces act along the normals of the lower face of the glass at ERAs, and of the upper
-one at fingers. Plates that deviate have modes that deviate: what each known mode adds is exchanged,
-and what all others add is scaled.
+factorized. Forces act along the normals, on the lower face of the glass at ERAs and on the upper
+face at fingers. For plates with other parameters, the contribution of each known mode is replaced,
+and the contribution of all other modes is scaled.
 """
 
 import subprocess
@@ -26,11 +26,11 @@ from model.study.exact_plates import Plates
 from model.vibration import Excitation, base_amplitudes
 
 RIG = Path(__file__).parents[1] / "examples" / "calculix" / "curved_glass.yaml"
-_STEP = 1e-4  # m, of differences by an ERA's place
+_STEP = 1e-4  # m, for differences with respect to an ERA's position
 
 
 class CurvedGlass:
-    """Its equations and modes, solved by CalculiX in a folder, and the rig's file there."""
+    """Equations and modes of the glass, solved by CalculiX in a folder, and its rig file."""
 
     def __init__(self, folder: Path) -> None:
         self._numbers = curved_glass.write_model(folder / "glass.inp")
@@ -48,7 +48,7 @@ class CurvedGlass:
         ).T
 
     def rows(self, places: FloatArray, layer: int) -> sparse.csr_array:
-        """Displacement along the normals at places (p, 2) [m] on the face of a layer, (p, dof)."""
+        """Return the displacement (p, dof) along normals at positions (p, 2) [m] of a layer."""
         mesh, found = curved_glass, sparse.lil_array((len(places), len(self._column)))
         for row, (u, v) in enumerate(places):
             along, across = u, v / mesh.width_at(u)
@@ -72,7 +72,7 @@ class CurvedGlass:
         frequency: float,
         loss_factor: float,
     ) -> ComplexArray:
-        """Displacement [m/N] of rows (o, dof) by forces along others (n, dof), (o, n)."""
+        """Return displacements (o, n) [m/N] of rows (o, dof) due to forces along rows (n, dof)."""
         omega = 2 * np.pi * frequency
         system = (1 + 1j * loss_factor) * self._stiffness - omega**2 * self._mass
         factors = splu(
@@ -84,12 +84,12 @@ class CurvedGlass:
         return np.asarray(observed @ factors.solve(forced.toarray().T.astype(complex)))
 
     def at(self, rows: sparse.csr_array) -> FloatArray:
-        """Mode shapes (p, r) of unit modal mass at rows."""
+        """Return mode shapes (p, r) of unit modal mass at rows."""
         return np.asarray(rows @ self._shapes)
 
 
 def _matrix(path: Path) -> sparse.csr_array:
-    """A symmetric matrix of which CalculiX wrote one half."""
+    """Return a symmetric matrix; CalculiX writes one half."""
     row, column, value = np.loadtxt(path).T
     half = sparse.coo_array((value, (row.astype(int) - 1, column.astype(int) - 1))).tocsr()
     whole: sparse.csr_array = (half + half.T - sparse.diags_array(half.diagonal())).tocsr()
@@ -97,7 +97,7 @@ def _matrix(path: Path) -> sparse.csr_array:
 
 
 def _quadratic(x: float, y: float) -> dict[tuple[int, int], float]:
-    """Shape functions of a quadrilateral of eight nodes at x, y within -1 to 1, by node."""
+    """Return shape functions of an eight-node quadrilateral at x, y (-1 to 1), by node."""
     found = {}
     for a in (-1, 0, 1):
         for b in (-1, 0, 1):
@@ -111,7 +111,7 @@ def _quadratic(x: float, y: float) -> dict[tuple[int, int], float]:
 
 
 class GlassOnEras:
-    """Responses of the glass with the rig's ERAs at its places for fingers, all solved at once."""
+    """Responses of the glass with the rig's ERAs at all finger positions, solved together."""
 
     def __init__(
         self,
@@ -141,7 +141,7 @@ class GlassOnEras:
 
     @property
     def fields(self) -> ComplexArray:
-        """Acceleration (f, n, p) [m/s²] at the cells by each ERA at full level, without fingers."""
+        """Acceleration (f, n, p) [m/s²] at the cells due to each ERA at full level, no fingers."""
         n, found = len(self._eras), []
         for frequency, whole in zip(self._frequencies, self._by_frequency, strict=True):
             spring, mass = self._springs(frequency)
@@ -157,13 +157,13 @@ class GlassOnEras:
         stiffer: FloatArray | float = 1.0,
         damped: FloatArray | float = 1,
     ) -> tuple[ComplexArray, FloatArray]:
-        """Stiffness of each ERA's spring with its damper, and omega² times its mass [N/m]."""
+        """Return each ERA's stiffness with its damper, and omega² times its mass [N/m]."""
         w = 2 * np.pi * frequency
         k, c, m = np.array([[e.stiffness, e.damping, e.bolt_mass] for e in self._eras]).T
         return stiffer * k + 1j * w * c * damped, w**2 * m
 
     def contrast_db(self, placed: Placement, excitation: Excitation, plates: Plates) -> FloatArray:
-        """Felt contrast [dB] of a target beside quiet fingers on glasses, (d,)."""
+        """Return the felt contrast (d,) [dB] of a target to quiet fingers on glasses."""
         fingers = [
             int(np.argmin(np.linalg.norm(self.places - each, axis=1))) for each in placed.contacts
         ]
@@ -174,7 +174,7 @@ class GlassOnEras:
             for each in fingers
             for point in range(self._points)
         ]
-        # From the rows of ERAs, moved by their errors, and of fingers to those that are forced.
+        # Responses of ERAs (moved by their errors) and fingers to forces at driven rows.
         chosen = np.zeros((count, n + len(fingers), len(forced)))
         chosen[:, range(n + len(fingers)), [*range(n), *range(3 * n, len(forced))]] = 1
         for axis in range(2):
@@ -210,7 +210,7 @@ class GlassOnEras:
         observed: Sequence[int],
         plates: Plates,
     ) -> ComplexArray:
-        """Receptances (d, o, n) of plates at a frequency, of rows by forces along others."""
+        """Return receptances (d, o, n) of plates at a frequency, of rows to forces along others."""
         w2 = (2 * np.pi * self._frequencies[row]) ** 2
         eta, own = self.rig.plate.loss_factor, self._glass.eigenvalues
         left, right = self._shapes[observed], self._shapes[forced]

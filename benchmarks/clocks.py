@@ -3,14 +3,14 @@
     python -m benchmarks.clocks [--seeds 2] [--moments 1 30] [--only WORDS] [--firmware SECONDS]
 
 Prints the table in the section Clocks of several amplifiers of docs/measured/figures.md, and the
-clock errors in docs/reference/several-amplifiers.md. Clocks: root mean square error of one clock
-over a second after some moments from arming on, and the host's estimate of it, while a finger
+clock errors in docs/reference/several-amplifiers.md. Clocks: root mean square error of a clock in
+the second after each moment since arming, and the host's estimate of this error, while a finger
 rests. Click: largest difference between the first and the last start in 40 clicks. Set: median time
-from a touch until all play, for three amplifiers and for one.
+from a touch until all amplifiers play, for three amplifiers and for a single one.
 
-The daemon's control loop runs in virtual time; crystals are 50 ppm off and warm up as in
-`draw_imperfections`. With --firmware three processes of the firmware on terminals run in real time,
-and their clocks are compared with the machine's.
+The daemon's control loop runs in virtual time. Crystals are 50 ppm off and warm up
+(`draw_imperfections`). With --firmware, three processes of the firmware run on terminals in real
+time, and their clocks are compared with the machine's.
 """
 
 import argparse
@@ -47,9 +47,9 @@ SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcan
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How three amplifiers are connected: wire and kind of line; is_bus: all on one line.
+    """Connection of three amplifiers: wire and kind of line; is_bus: whether all share a line.
 
-    has_mark: whether they know Mark.
+    has_mark: whether the amplifiers support Mark.
     """
 
     wire: str
@@ -58,7 +58,7 @@ class Arrangement:
     has_mark: bool = True
 
     def wires(self, names: tuple[str, ...], seed: int) -> Mapping[str, SimulatedWire]:
-        """The wires by amplifier."""
+        """Return the wires by amplifier."""
         return {
             name: SimulatedWire(
                 self.wire,
@@ -80,26 +80,26 @@ class Session:
     far: Any
 
     def touch(self, *places: tuple[float, float]) -> float:
-        """Report these fingers alone; returns the time [s]."""
+        """Report these fingers and no others; return the time [s]."""
         touches = tuple(Touch(number, *place) for number, place in enumerate(places, start=1))
         now = threads.now()
         self.controller.cycle.deliver(TouchFrame("panel", now, touches))
         return now
 
     def differences(self) -> list[float]:
-        """Return by how much the clocks of each two amplifiers differ now [s]."""
+        """Return the present differences between the clocks of each pair of amplifiers [s]."""
         now = threads.now()
         shown = [each.clock.seconds(now) for each in self.far.bench.amplifiers.values()]
         return [math.remainder(one - other, CLOCK_TURN) for one, other in combinations(shown, 2)]
 
 
 def make_rig(names: tuple[str, ...]) -> Rig:
-    """The paper's plate, its ERAs on amplifiers of these names in turn."""
+    """Return the paper's plate with its ERAs on amplifiers with these names, in turn."""
     return on_amplifiers(make_paper_rig(12, 9), names)  # type: ignore[no-any-return]
 
 
 def make_controller(rig: Rig, urls: Mapping[str, str], **more: Any) -> Controller:
-    """A control loop in which the newest finger feels a buzz; more: as a `Controller` takes."""
+    """Return a control loop in which the newest finger feels a buzz; more: for `Controller`."""
     table = small_table()
     intents, timing = EffectPlayer(SurfaceLayout()), Timing(table)
     return Controller(
@@ -129,11 +129,11 @@ async def armed(
             await running
 
 
-_JUDGED = 10  # exchanges with the shortest times: one in so many
+_JUDGED = 10  # the shortest one in this many exchanges is used
 
 
 class _Readings:
-    """What the clock of an amplifier shows in its statuses: time of the exchange, lead [s]."""
+    """Readings of an amplifier's clock in its statuses: time of the exchange, lead [s]."""
 
     def __init__(self, amplifier: Amplifier) -> None:
         self.taken: list[tuple[float, float]] = []
@@ -148,13 +148,13 @@ class _Readings:
         self._note(name, values, reply, sent_at)
 
     def lead(self) -> tuple[float, float]:
-        """Return the lead of the clock and half the time of the exchanges that tell it [s]."""
+        """Return the lead of the clock and half the time of its best exchanges [s]."""
         prompt = sorted(self.taken)[: max(len(self.taken) // _JUDGED, 1)]
         return statistics.median([lead for _, lead in prompt]), prompt[-1][0] / 2
 
 
 async def firmware_skew(seconds: float) -> tuple[float, float]:
-    """Return the rms of one clock in the last half of a time, and how well it is known [s]."""
+    """Return the RMS error of a clock in the last half of a time, and its uncertainty [s]."""
     readings: list[_Readings] = []
 
     def watch(amplifiers: Mapping[str, Amplifier]) -> None:
@@ -199,11 +199,11 @@ _WINDOW, _STEP = 1.0, 0.05  # s
 _TAPS, _HELD, _APART = 40, 0.05, 0.25  # s
 
 Skews: TypeAlias = tuple[list[float], list[float]]
-"""Differences of clocks, and errors that are stated of them [s]."""
+"""Differences of clocks, and their stated errors [s]."""
 
 
 async def skews(lines: Arrangement, seed: int, moments: Sequence[float]) -> list[Skews]:
-    """Return those in a second from each moment after arming on."""
+    """Return the differences in the second after each moment since arming."""
     found = []
     async with armed(lines, seed) as session:
         begin = threads.now()
@@ -240,7 +240,7 @@ async def taps(lines: Arrangement, seed: int, names: tuple[str, ...]) -> list[tu
 
 
 def _starts(session: Session, since: float) -> list[float]:
-    """When each amplifier began to play what it plays [s]; none before a time."""
+    """Return the times at which amplifiers began their present vibration [s], after a time."""
     session.far.bench.advance(threads.now())
     return [
         min(begun)
@@ -261,7 +261,7 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seeds", type=int, default=4, help="runs of each arrangement")
     parser.add_argument("--moments", type=float, nargs="*", default=[1.0, 30.0, 600.0])

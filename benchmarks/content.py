@@ -2,19 +2,19 @@
 
     python -m benchmarks.content [--files FOLDER] [--count 40] [--pairs 0] [--workers 2]
 
-Prints the shares in docs/how-to/play-content.md and docs/measured/figures.md: of the time in which
-the level at the skin is within 3 dB of the requested level, where that is within 20 dB of its
-highest, as in `era content check`; with the delay of at most 10 ms that suits all files best. Once
-for whole files, and once without the transients that are no clicks because they are too close to
-stronger ones. The finger is alone on the paper's plate.
+Prints the shares in docs/how-to/play-content.md and docs/measured/figures.md: the share of the time
+in which the level at the skin is within 3 dB of the requested level. Like `era content check`, it
+counts only times at which the requested level is within 20 dB of its maximum. The delay is the best
+one for all files, at most 10 ms. A second row omits transients that are not clicks because they are
+too close to stronger ones. The finger is alone on the paper's plate.
 
-With --pairs also next to so many other fingers, anywhere 5 cm apart, over the wire, on plates,
-drives and fingers drawn within the rig's uncertainty: contrast of the strongest 40 ms, promised and
-felt. Loop, line and amplifiers then run in virtual time, as in `benchmarks.promise.session`.
+With --pairs, it also prints the promised and felt contrast of the strongest 40 ms with another
+finger at least 5 cm away, over the wire, on plates, drives and fingers drawn within the rig's
+uncertainty. Loop, line and amplifiers then run in virtual time (`benchmarks.promise.session`).
 
-Without --files, the built-in contents. From a folder the first readable files in order of name that
-request anything; equal files count once. Exits with status 1 unless half of the files keep 95 % and
-90 % of them keep 80 %, and 86 to 94 % of the promises are kept.
+Without --files, the built-in contents are used, otherwise the first readable files of the folder,
+in order of name, that request a vibration; equal files count once. Exits with status 1 unless half
+of the files keep 95 %, 90 % of the files keep 80 %, and 86 to 94 % of the promises are kept.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def main() -> None:
     )
     parser.add_argument("--files", type=Path, help="folder; default: the named contents")
     parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--pairs", type=int, default=0, help="fingers beside each file")
+    parser.add_argument("--pairs", type=int, default=0, help="other fingers for each file")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     patterns = [*dict.fromkeys(_patterns(options.files))][: options.count]
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def _print_alone(patterns: Sequence[Pattern]) -> bool:
-    """Print what is kept; returns whether that is enough."""
+    """Print the shares; return whether they are sufficient."""
     table, delays = CASE.table, np.linspace(0, MAX_DELAY, 11)
     shares, lost = [], 0
     for pattern in patterns:
@@ -112,7 +112,7 @@ def _print_alone(patterns: Sequence[Pattern]) -> bool:
 
 
 def _print_beside(patterns: Sequence[Pattern], pairs: int, workers: int) -> bool:
-    """Print what is promised and felt beside other fingers; returns whether enough is kept."""
+    """Print contrasts to another finger; return whether enough promises are kept."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         running = [
             pool.submit(outcome, each, LEVEL_DB_SL, pair, len(patterns) * pair + number)
@@ -135,7 +135,7 @@ def _print_beside(patterns: Sequence[Pattern], pairs: int, workers: int) -> bool
 
 
 def _patterns(folder: Path | None) -> Iterator[Pattern]:
-    """What can be read of a folder in order of name, or the named contents."""
+    """Yield the readable files of a folder in order of name, or the named contents."""
     paths = [named_content(each) for each in named_contents()]
     for path in paths if folder is None else sorted(folder.iterdir()):
         try:
@@ -157,11 +157,11 @@ def _timing() -> Timing:
 
 
 def outcome(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tuple[float, float]:
-    """Contrast [dB] of what lasts, else of the taps: promised, and felt over the whole file.
+    """Return the contrast [dB] of continuous events, or of taps: promised, and felt in the file.
 
-    pair: number of the places; seed: of plate, ERAs, drives and fingers. The strongest 40 ms at the
-    finger above the strongest at the loudest point of the other one, the least over the sets of
-    thresholds.
+    pair: number of the positions; seed: of plate, ERAs, drives and fingers. The felt contrast is
+    the level of the strongest 40 ms at the finger, relative to the strongest 40 ms at the loudest
+    point of the other finger, the lowest over the threshold sets.
     """
     found: tuple[float, float] = run_virtual(_run(pattern, level_db_sl, pair, seed))
     return found

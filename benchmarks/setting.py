@@ -1,4 +1,4 @@
-"""What benchmarks have in common: the paper's rig, contact sets, and parts of pages they write."""
+"""Shared code of benchmarks: contact sets, and parts of pages that they write."""
 
 import re
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ def random_contacts(
     apart: float = APART,
     beside: Sequence[tuple[float, float]] = (),
 ) -> FloatArray:
-    """Contacts (count, 2) [m] on a plate of a size, so far apart and so far from its edges.
+    """Return contacts (count, 2) [m] on a plate, with minimum distances to each other and edges.
 
-    beside: places [m] on the plate that they are as far from.
+    beside: other positions [m] at the same minimum distance.
     """
     while True:
         places = rng.uniform(margin, np.array(size) - margin, (count, 2))

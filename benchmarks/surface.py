@@ -4,18 +4,19 @@
 
 Prints the tables in the section Accuracy of docs/how-to/surface.md; --page writes them there.
 
-The paper's plate is exported as another program would, by its modes at 25 x 19 nodes up to
-1.5, 3 and 5 times the highest frequency of its limits, and imported as a surface. Compared with the
-plate's own table: largest and mean difference of the fields of all ERAs, and the error that the
-surface's table states; the median promise of each table to one finger with one to three quiet
-fingers (phased); the share of promises that hold on plates drawn around the plate.
+The modes of the paper's plate are exported like from another program, at 25 x 19 nodes and up to
+1.5, 3 and 5 times the highest frequency of its limits, and imported as a surface. The table of the
+surface is compared with the table of the plate: largest and mean difference of the fields of all
+ERAs, and the error that the surface's table states; the median promise of each table to a finger
+with one to three quiet fingers (phased); and the share of promises kept on plates drawn within the
+tolerances.
 
-With --solver calculix the same for the curved glass of examples/calculix with six ERAs, whose modes
-and equations CalculiX computes (`benchmarks.calculix`); two to four of FINGERS positions, switched
-and phased, on glasses drawn within the rig's uncertainty, at last with each mode drawn separately.
-Exits with status 1 unless 80 to 98 % of the promises are kept, and mean field errors are below 3 %
-with modes up to 2.5 times the highest frequency or more. With --wire three contents on that glass
-through the complete signal chain.
+With --solver calculix, the comparison uses the curved glass of examples/calculix with six ERAs,
+whose modes and equations CalculiX computes (`benchmarks.calculix`). Two to four fingers are at some
+of FINGERS positions, switched and phased, on glasses drawn within the rig's uncertainty; the last
+rows draw each mode separately. Exits with status 1 unless 80 to 98 % of the promises are kept, and
+mean field errors are below 3 % with modes up to at least 2.5 times the highest frequency. With
+--wire, three contents play on this glass through the complete signal chain.
 """
 
 import argparse
@@ -48,12 +49,12 @@ from model.table.table_file import build_table
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "surface.md"
 MULTIPLES = (1.5, 3.0, 5.0)
 OF_THE_GLASS = (1.5, 2.5, 7.5)
-"""Multiples of the highest frequency up to which modes are taken."""
+"""Multiples of the highest frequency up to which modes are used."""
 OF_MODES = {"thickness": 0.0, "modulus": 0.0, "mode_frequency": 0.015, "mode_amplitude": 0.05}
-"""Uncertainty of a glass whose modes differ each by itself, in place of all of them together."""
+"""Uncertainty of a glass with individual differences of modes, instead of common ones."""
 NODES = 25, 19
 FINGERS, GLASSES, FREQUENCIES = 40, 60, 12
-"""Places for fingers on the glass, glasses drawn for each set, and frequencies of its table."""
+"""Numbers of finger positions, of glasses drawn for each set, and of table frequencies."""
 MARGIN = 0.012  # m, of fingers from every edge of the glass
 
 
@@ -73,7 +74,7 @@ def main() -> None:
 
 
 def _of_the_plate(sets: int) -> tuple[list[str], bool]:
-    """Rows of the paper's plate."""
+    """Return the rows of the paper's plate, and whether they are good."""
     rig = load_rig(RIG)
     own = build_table(rig, drive_mode="phased")
     size = rig.plate.length, rig.plate.width
@@ -119,7 +120,7 @@ def _of_the_plate(sets: int) -> tuple[list[str], bool]:
 
 
 def _of_the_glass(sets: int) -> tuple[list[str], bool]:
-    """Rows of the curved glass, and whether they are good."""
+    """Return the rows of the curved glass, and whether they are good."""
     rows = [
         "| modes up to | drive | largest field error | mean | mean of the stated error "
         "| nominal / dB | promised / dB | median of the panels / dB | promises kept |",
@@ -182,7 +183,7 @@ def _of_the_glass(sets: int) -> tuple[list[str], bool]:
 
 
 def _through_the_wire(sets: int) -> tuple[list[str], bool]:
-    """Rows of three contents on glasses that deviate, and whether they are good."""
+    """Return rows of three contents on drawn glasses, and whether they are good."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         CurvedGlass(Path(folder))
@@ -198,7 +199,7 @@ def _through_the_wire(sets: int) -> tuple[list[str], bool]:
 
 
 def _places_on(rig: Rig) -> FloatArray:
-    """Places (n, 2) [m] for fingers, whole fingertips away from the edges of a surface."""
+    """Return finger positions (n, 2) [m], at least a fingertip from the edges of a surface."""
     around = MARGIN * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     found = list[Any]()
     for place in np.random.default_rng(2).uniform(0, (rig.plate.length, rig.plate.width), (999, 2)):
@@ -208,7 +209,7 @@ def _places_on(rig: Rig) -> FloatArray:
 
 
 def _some_of(places: FloatArray, number: int) -> Placement:
-    """A target and one to three quiet fingers, 5 cm apart, of these places [m]."""
+    """Return a target and one to three quiet fingers, 5 cm apart, at some positions [m]."""
     rng = np.random.default_rng([5, number])
     while True:
         chosen = places[rng.choice(len(places), 2 + number % 3, replace=False)]
@@ -219,7 +220,7 @@ def _some_of(places: FloatArray, number: int) -> Placement:
 
 
 def _as_surface(rig: Rig, highest: float, folder: Path) -> Rig:
-    """Return a rig with a surface in place of its plate, by the plate's modes up to a frequency."""
+    """Return a rig with a surface made of its plate's modes up to a frequency."""
     arrays: dict[str, Any] = {**exported_modes(rig, highest, NODES)}
     arrays["damping_ratios"] = np.full(len(arrays["frequencies"]), rig.plate.loss_factor / 2)
     np.savez(folder / "modes.npz", **arrays)
@@ -232,7 +233,7 @@ def _as_surface(rig: Rig, highest: float, folder: Path) -> Rig:
 
 
 def exported_modes(rig: Rig, highest: float, nodes: tuple[int, int]) -> dict[str, FloatArray]:
-    """Return the modes of a rig's free plate up to a frequency [Hz], as another program has them.
+    """Return the modes of a rig's free plate up to a frequency [Hz], like from another program.
 
     nodes: numbers of nodes along x and y, at which shapes along z are given.
     """

@@ -1,12 +1,12 @@
-"""How far the intervals of a calibration hold: `python -m benchmarks.calibration [PLATES] [SHARE]`.
+"""Coverage of a calibration's intervals: `python -m benchmarks.calibration [PLATES] [SHARE]`.
 
 Prints the table in the section Calibration of docs/measured/figures.md, by the number of sensors:
-how often intervals of 90 % hold the true value on plates that another process hides. SHARE is that
-of the form errors that a fit allows for.
+how often 90 % intervals contain the true value on plates that another process hides. SHARE is the
+size of form errors relative to the errors that a fit allows for.
 
 Gain, phase: effect of every ERA at every frequency, compared with the uncertainty in the calibrated
-rig. Field: its error with the best gains, root mean square over the plate. Other values: compared
-with their standard errors.
+rig. Field: the error of the field with the best gains, root mean square over the plate. Other
+values are compared with their standard errors.
 """
 
 import json
@@ -35,7 +35,7 @@ _NORMAL = 1.645  # standard errors either side: 90 %
 def deviations(
     rig: Rig, responses: Measurement, truth: dict[str, list[float]]
 ) -> dict[str, tuple[FloatArray, float]]:
-    """Errors in standard errors by kind of value, and the standard error, relative."""
+    """Return errors in standard errors, and relative standard errors, by kind of value."""
     found = calibrate(rig, responses)
     real, imaginary = np.array(truth["fields"])
     gains, phases, fields = field_deviations(found.rig, real + 1j * imaginary)
@@ -57,7 +57,7 @@ def deviations(
 
 
 def main(count: int, share: float) -> None:
-    """Print tables of kinds of values by the number of sensors, of more and more plates."""
+    """Print tables of kinds of values over numbers of sensors, for a growing number of plates."""
     rig = load_rig(RIG)
     held: dict[tuple[str, int], list[float]] = defaultdict(list)
     sizes: dict[tuple[str, int], list[float]] = defaultdict(list)
@@ -86,7 +86,7 @@ def main(count: int, share: float) -> None:
 def show(
     held: dict[tuple[str, int], list[float]], sizes: dict[tuple[str, int], list[float]]
 ) -> None:
-    """Print shares of intervals that hold, and median standard errors."""
+    """Print the coverage of intervals, and median standard errors."""
     print("intervals of 90 % that hold the truth (median standard error), by sensors")
     print(f"{'':>12} " + " ".join(f"{column!s:>16}" for column in (*CHOSEN, "all")))
     for kind in dict.fromkeys(kind for kind, _ in held):

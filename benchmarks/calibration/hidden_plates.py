@@ -1,9 +1,9 @@
 """Plates that calibration must identify without knowing how they were made.
 
-Solved with finite elements of fourth order (Q4, strips along the edges) and a sparse solve for each
-frequency, where the product uses modes of polynomials; with form errors that the rig's description
-cannot express, or a share of them. They are as large as a fit allows for, but stated here again: a
-fit that allowed for less would fail on these plates.
+They are solved with finite elements of fourth order (Q4, strips along the edges) and a sparse solve
+for each frequency, while the product uses modes of polynomials. They have form errors that a rig
+file cannot express, as large as a fit allows for, times SHARE. The sizes are stated here again, so
+that a fit that allows for less fails on these plates.
 
     python -m benchmarks.calibration.hidden_plates FOLDER FIRST COUNT SHARE
 
@@ -36,7 +36,7 @@ from model.structure.sources import Era
 MESH = (6, 5)  # within 0.1 % of converged, with strips
 STRIP = 3e-3  # m, twice the plate's thickness
 FREQUENCIES = np.arange(40.0, 501.0, 20.0)
-# Twelve sensors on no line of symmetry, as shares of the sides.
+# Twelve sensors off all lines of symmetry, as fractions of the sides.
 SENSORS = np.array(
     [
         *([0.07, 0.15], [0.37, 0.08], [0.67, 0.18], [0.94, 0.12]),
@@ -47,10 +47,10 @@ SENSORS = np.array(
 
 FIELD_POINTS = np.stack(np.meshgrid([0.1, 0.3, 0.5, 0.7, 0.9], [0.12, 0.37, 0.63, 0.88]), -1)
 FIELD_POINTS = FIELD_POINTS.reshape(-1, 2)
-"""Where fingers may be, as shares of the sides."""
+"""Finger positions, as fractions of the sides."""
 
 CHOSEN = {3: [0, 6, 9], 4: [0, 3, 5, 10], 6: [0, 2, 4, 7, 9, 10], 12: list(range(12))}
-"""Sensors of those above, by their number."""
+"""Indices of the used sensors, by number of sensors."""
 
 FORM = {
     "place": 1.5e-3,
@@ -60,16 +60,16 @@ FORM = {
     "sensor_scale": 0.01,
     "mass": 0.01,
 }
-"""Standard deviations of what a rig file does not say.
+"""Standard deviations of form errors, which a rig file does not contain.
 
-Places of ERAs along each side, length and width, places of sensors [m]; of Poisson's ratio; of
-sensors' scales, relative; of one foreign mass anywhere, relative to the plate's.
+Positions of ERAs along each side, length and width, positions of sensors [m]; Poisson's ratio;
+scales of sensors, relative; a foreign mass at any position, relative to the plate's mass.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenPlate:
-    """A plate: its rig with true values, as it is built, and the matrices of its solver."""
+    """A plate: the rig with true values, and the matrices of its solver."""
 
     rig: Rig
     masses: tuple[PointLoad, ...]
@@ -78,7 +78,7 @@ class HiddenPlate:
     scales: FloatArray
 
     def responses(self, frequencies: FloatArray, points: FloatArray) -> ComplexArray:
-        """Acceleration per commanded displacement [1/s²], gains included, (f, e, p)."""
+        """Return the acceleration per commanded displacement (f, e, p) [1/s²], with gains."""
         eras = self.rig.eras
         found = direct_acceleration(self.matrices, eras, frequencies, points, loads=self.masses)
         return np.asarray(found / np.array([era.full_level for era in eras])[:, None])
@@ -94,7 +94,7 @@ def draw_plate(
 ) -> HiddenPlate:
     """Draw a plate within a builder's tolerances of a rig, with form errors.
 
-    form: standard deviations as in FORM.
+    form: standard deviations with the keys of FORM.
     """
     rng = np.random.default_rng([seed, 50])
     plate = rig.plate
@@ -118,7 +118,7 @@ def draw_plate(
     )
     eras = []
     for era in (each for each in rig.eras if isinstance(each, Era)):
-        # Bolts of an edge can only be off inwards.
+        # Bolts at an edge can only be displaced inward.
         at = np.array([era.x, era.y]) / [plate.length, plate.width]
         inwards = np.where(at > 0.5, -1.0, 1.0)
         place = at * sides + inwards * np.abs(error("place", 2))
@@ -159,9 +159,9 @@ def measure(
     noise: float = 0.01,
     count: int = 12,
 ) -> Measurement:
-    """Measure with sensors where the rig's owner believes them; noise of each row's rms.
+    """Measure with sensors at their nominal positions; noise is relative to each row's RMS.
 
-    count: of the sensors that are used, far from each other.
+    count: number of sensors, which are far from each other.
     """
     rng = np.random.default_rng([seed, 51])
     some = CHOSEN[count]
@@ -175,29 +175,29 @@ def measure(
 
 
 def true_values(rig: Rig) -> list[float]:
-    """The fitted values in the order of `SensedPlate.parameters`."""
+    """Return the fitted values in the order of `SensedPlate.parameters`."""
     values = [rig.plate.material.E, rig.plate.loss_factor]
     return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.in_time.mass)]
 
 
 def gains_of(rig: Rig) -> ComplexArray:
-    """Gains (f, e) of the drives."""
+    """Return the gains (f, e) of the drives."""
     rows = np.array([era.gains for era in rig.eras])  # (e, f, 3)
     return np.asarray((rows[..., 1] * np.exp(1j * rows[..., 2])).T)
 
 
 def fields_of(hidden: HiddenPlate) -> ComplexArray:
-    """True fields of a plate at FIELD_POINTS and the frequencies of its gains, (f, e, p)."""
+    """Return true fields (f, e, p) at FIELD_POINTS and the frequencies of the gains."""
     frequencies = np.array([row[0] for row in hidden.rig.eras[0].gains])
     plate = hidden.rig.plate
     return hidden.responses(frequencies, FIELD_POINTS * [plate.length, plate.width])
 
 
 def field_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
-    """Errors of a rig's fields against those of `fields_of` (f, e, p), in its uncertainties.
+    """Return errors (3, f, e) of a rig's fields against `fields_of`, relative to its uncertainty.
 
-    Of the gains that a rig's fields have best, magnitudes and phases, then of the fields with
-    these, root mean square, (3, f, e).
+    The rows are the errors of magnitude and phase of the best gains, and the root mean square error
+    of the fields with these gains.
     """
     points = FIELD_POINTS * [rig.plate.length, rig.plate.width]
     frequencies = np.array([row[0] for row in rig.eras[0].gains])
@@ -217,7 +217,7 @@ def field_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
 
 
 def sensors_of(seed: int) -> int:
-    """How many sensors a plate has."""
+    """Return the number of sensors of a plate."""
     return list(CHOSEN)[seed % len(CHOSEN)]
 
 

@@ -14,10 +14,10 @@ A pattern has for each driven ERA the frequency [Hz], the level 0..1 of its stro
 [degrees]: the base moves by level * stroke * sin(2 pi frequency t + phase).
 
 The score of a set is the 10th percentile of the contrast, over plates drawn within the rig's
-uncertainty and solved exactly. A set without a pattern counts 0 dB, and so does a pattern that
-leaves the target more than 0.5 dB below the level on more than 10 % of the plates. The optimum in
-hindsight climbs this percentile itself (Adam, from several starts at the best frequencies),
-independently of the model's search.
+uncertainty and solved exactly. A set without a pattern counts 0 dB, and so does a pattern whose
+target is more than 0.5 dB below the level on more than 10 % of the plates. The optimum in hindsight
+maximizes this percentile (Adam, from several starts at the best frequencies), independently of the
+model's search.
 """
 
 import hashlib
@@ -67,7 +67,7 @@ def score_entry(
 ) -> None:
     """Score the patterns of a file on held-out plates.
 
-    The score is the felt contrast that nine of ten of them give.
+    The score is the felt contrast that 90 % of the plates reach.
     """
     name, excitations = read_entry(file)
     with progress_bar("contact sets") as progress:
@@ -121,14 +121,14 @@ def export_data_set(
 
 VERSION = 1
 CHECKSUM = "ba4469e87f93685903c0d2095d9dc62f2ae3a56c617015744030eaefa7fc4ada"
-"""SHA-256 of the file of this version."""
+"""SHA-256 of the data set's file."""
 
 FILE = Path(__file__).with_name(f"localization-{VERSION}.json")
 
 
 @dataclass(frozen=True)
 class ContactSet:
-    """Fingers [m] on a plate, the target first; number: its place in the file, from 0."""
+    """Fingers [m] on a plate, the target first; number: index in the file, from 0."""
 
     name: str
     number: int
@@ -136,12 +136,12 @@ class ContactSet:
 
     @property
     def quiet_count(self) -> int:
-        """Number of fingers that shall feel nothing."""
+        """Number of fingers that must feel nothing."""
         return len(self.contacts) - 1
 
     @property
     def placement(self) -> Placement:
-        """The target, and the others."""
+        """The target and the quiet fingers."""
         return Placement(self.contacts[:1], self.contacts[1:])
 
 
@@ -159,8 +159,8 @@ class BenchmarkPlate:
 class DataSet:
     """The data set.
 
-    level_db_sl: that nine of ten plates must reach at the target; draws, seed: of held-out plates
-    for each set; in_time: seeds of plates in time, by turns.
+    level_db_sl: level that 90 % of plates must reach at the target; draws, seed: of held-out plates
+    for each set; in_time: seeds of plates in time, used in turn.
     """
 
     level_db_sl: float
@@ -194,7 +194,7 @@ def data_set() -> DataSet:
 
 
 def checksum() -> str:
-    """SHA-256 of the file that `data_set` reads."""
+    """Return the SHA-256 of the file that `data_set` reads."""
     return hashlib.sha256(FILE.read_bytes()).hexdigest()
 
 
@@ -240,7 +240,7 @@ def _rigs(found: DataSet) -> dict[str, Rig]:
 
 
 def _excitation(rig: Rig, drives: Mapping[str, tuple[float, float, float]]) -> Excitation:
-    """Tones by ERA, those of level 0 left out."""
+    """Return tones by ERA, without tones of level 0."""
     strokes = rig.full_levels
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     tones = {}
@@ -262,13 +262,13 @@ def _excitation(rig: Rig, drives: Mapping[str, tuple[float, float, float]]) -> E
 
 STARTS, STEPS, RATE = 8, 120, 0.05
 NEAR = 0.05
-"""Scenarios whose rank is within this share of the percentile's have a say in its gradient."""
+"""Maximum distance of a plate's rank from the percentile, as a share, to affect its gradient."""
 
 
 class Fingers(Protocol):
-    """Fingers on plates, the first of them the target.
+    """Fingers on plates; the first finger is the target.
 
-    finger (p,): whose point; weights (p,): of the mean over its disc.
+    finger (p,): finger of each point; weights (p,): of the point in the mean over the fingertip.
     """
 
     finger: FloatArray
@@ -276,15 +276,15 @@ class Fingers(Protocol):
     finger_count: int
 
     def accelerations(self, frequency: float, plates: Any) -> ComplexArray:
-        """Acceleration [m/s²] at the points of each ERA at full stroke, (m, p, eras)."""
+        """Return accelerations (m, p, eras) [m/s²] at the points due to ERAs at full stroke."""
         ...
 
 
 class Plates(Protocol):
-    """Plates that deviate."""
+    """Plates within the tolerances."""
 
     def first(self, count: int) -> "Plates":
-        """The first of them."""
+        """Return the first plates."""
         ...
 
 
@@ -299,7 +299,7 @@ class Drive:
 def contrasts_db(
     fingers: Fingers, fields: ComplexArray, weights: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Contrast [dB] and acceleration of the target [m/s²] on each plate, (m,) both.
+    """Return contrast [dB] and acceleration of the target [m/s²] on each plate, both (m,).
 
     fields (..., m, p, eras), weights (..., eras).
     """
@@ -317,7 +317,7 @@ def optimum(
     percentile: float,
     least: FloatArray,
 ) -> Drive:
-    """Find the drive of the highest percentile of contrast over plates.
+    """Find the drive with the highest percentile of contrast over plates.
 
     least (f,) [m/s²]: acceleration that the target must have at full stroke, in the tenth
     percentile of the plates; 0 for none.
@@ -346,7 +346,7 @@ def optimum(
 def _worth(
     fingers: Fingers, fields: ComplexArray, weights: ComplexArray, percentile: float, least: float
 ) -> float:
-    """The percentile, less two decibels for every one that the level falls short of."""
+    """Return the percentile minus two decibels for each decibel of missing level."""
     contrast, target = contrasts_db(fingers, fields, weights / np.abs(weights).max())
     worth = float(np.percentile(contrast, percentile))
     if least > 0:
@@ -356,7 +356,7 @@ def _worth(
 
 
 def _starts(fingers: Fingers, fields: ComplexArray) -> list[ComplexArray]:
-    """Weights of the least mean power at the quiet fingers, for several weightings of them."""
+    """Return weights that minimize mean power at the quiet fingers, for several weightings."""
     target = fields[:, fingers.finger == 0].mean(axis=(0, 1))
     forms = []
     for finger in range(1, fingers.finger_count):
@@ -377,7 +377,7 @@ def _starts(fingers: Fingers, fields: ComplexArray) -> list[ComplexArray]:
 def _climb(
     fingers: Fingers, fields: ComplexArray, weights: ComplexArray, percentile: float, least: float
 ) -> ComplexArray:
-    """Adam on the mean of the contrasts whose rank is near the percentile."""
+    """Maximize the mean of the contrasts with a rank near the percentile by Adam."""
     is_target = fingers.finger == 0
     over = fingers.weights[is_target]
     target_fields, quiet_fields = fields[:, is_target], fields[:, ~is_target]
@@ -410,7 +410,7 @@ def _climb(
         loss /= np.abs(quiet[near, None]) ** 2
         gradient = (gain - loss).mean(axis=0)
         if short > 0:
-            # Towards the level: more of the target for the strongest weight.
+            # Toward the level: more amplitude at the target for the strongest weight.
             strongest = np.abs(weights).argmax()
             towards = gain.mean(axis=0)
             towards[strongest] -= weights[strongest] / np.abs(weights[strongest]) ** 2
@@ -428,7 +428,7 @@ DURATION = 1.5  # s; the slowest mode has settled then
 
 @dataclass(frozen=True)
 class SetScore:
-    """Contrast [dB] and level [dB SL] that nine of ten plates give; in time: of one plate, or None.
+    """Contrast [dB] and level [dB SL] that 90 % of plates reach; in time: of a plate, or None.
 
     contrast_db is 0 for a pattern below the level, or none.
     """
@@ -451,9 +451,9 @@ def score(
     in_time: bool = False,
     progress: Progress = unseen,
 ) -> dict[str, SetScore]:
-    """Score the excitations by set, of every plate that has one; in_time: play each, too.
+    """Score the excitations by contact set; in_time: whether to also play each in time.
 
-    progress: called with the number of sets that are done and the total. Raises InputError.
+    progress: called with the number of finished sets and the total. Raises InputError.
     """
     found = data_set()
     plates = [
@@ -469,7 +469,7 @@ def score(
 
 
 def summary(scores: Mapping[str, SetScore]) -> list[dict[str, Any]]:
-    """A row by plate and number of quiet fingers: median and tenth percentile over the sets."""
+    """Return rows by plate and number of quiet fingers: median and tenth percentile over sets."""
     rows = []
     for plate, quiet in dict.fromkeys((s.plate, s.quiet_count) for s in scores.values()):
         some = [s for s in scores.values() if (s.plate, s.quiet_count) == (plate, quiet)]
@@ -519,7 +519,7 @@ def _of_plate(
 def on_held_out(
     found: DataSet, table: LocalizationTable, contacts: ContactSet, excitation: Excitation
 ) -> tuple[float, float]:
-    """Felt contrast [dB] and level [dB SL] that nine of ten held-out plates give."""
+    """Return felt contrast [dB] and level [dB SL] that 90 % of held-out plates reach."""
     plates = draw_plates(
         np.random.default_rng([found.seed, contacts.number]),
         table.uncertainty,

@@ -8,11 +8,11 @@ frequencies, the best one on the nominal plate:
 
 - random: any frequency, levels and phases
 - time-reversal: each ERA by the conjugate of its field at the target
-- paper: one or two ERAs at full stroke, each at any frequency, the best nominally
+- paper: one or two ERAs at full stroke, each at any frequency, with the best nominal contrast
 - era-haptics: `era.query`, mode phased
-- hindsight: climbed on the plates that judge, at the four frequencies of best promise
+- hindsight: optimized on the scoring plates, at the four frequencies with the best promise
 
-`examples/sound_zones.py` writes those of acoustic contrast control and pressure matching.
+`examples/sound_zones.py` writes entries of acoustic contrast control and pressure matching.
 """
 
 import argparse
@@ -70,7 +70,7 @@ class _Case:
 
     @property
     def weights(self) -> FloatArray:
-        """Of the points in the mean over the target, 0 at the others, (points,)."""
+        """Weights (points,) in the mean over the target, 0 at other points."""
         weights = read_fingertips(self.table, self.placed.contacts).fine_weights.astype(float)
         weights[1:] = 0
         return weights.ravel()
@@ -82,7 +82,7 @@ class _Case:
         return np.repeat(np.arange(len(tips)) == 0, tips.shape[1])
 
     def excitation(self, frequency: float, weights: ComplexArray) -> Excitation:
-        """Weights (eras,), the largest at full stroke."""
+        """Return the excitation for weights (eras,), the largest at full stroke."""
         weights = weights / np.abs(weights).max()
         return {
             era.name: Tone.from_phasor(frequency, complex(era.full_level * weight))
@@ -90,7 +90,7 @@ class _Case:
         }
 
     def best(self, weights: ComplexArray) -> Excitation:
-        """Of weights (f, eras), those of the best nominal contrast."""
+        """Return the excitation with the best nominal contrast, for weights (f, eras)."""
         size = np.abs(np.einsum("fpe,fe->fp", self.fields, weights))
         contrast = (size @ self.weights) / size[:, ~self.is_target].max(axis=1)
         row = int(contrast.argmax())
@@ -123,7 +123,7 @@ def _ours(case: _Case) -> Excitation:
 
 @dataclass(frozen=True, eq=False)
 class _HeldOut:
-    """What `optimum` climbs: the fingers of a set on the plates that judge."""
+    """Objective of `optimum`: the fingers of a set on the scoring plates."""
 
     case: _Case
     finger: FloatArray
@@ -141,7 +141,7 @@ class _Drawn:
     plates: Plates
 
     def first(self, count: int) -> "_Drawn":
-        """The first of them."""
+        """Return the first plates."""
         return _Drawn(Plates(**{key: value[:count] for key, value in vars(self.plates).items()}))
 
 
@@ -166,7 +166,7 @@ def _hindsight(case: _Case) -> Excitation:
     fingers = _HeldOut(case, np.repeat(np.arange(k), points), case.weights, k)
     least = 10 ** (case.found.level_db_sl / 20) * table.thresholds[rows]
     drive = optimum(
-        cast("Any", fingers),  # what it uses of them
+        cast("Any", fingers),  # the methods that it uses
         table.frequencies[rows],
         cast("Any", _Drawn(plates)),
         percentile=10,
@@ -185,7 +185,7 @@ METHODS: Mapping[str, Callable[[_Case], Excitation]] = {
 
 
 def entry(name: str, plates: list[str]) -> dict[str, object]:
-    """The entry of a method on plates of the data set."""
+    """Return the entry of a method on plates of the data set."""
     found, patterns = data_set(), {}
     for plate in plates:
         table = build_table(found.plates[plate].rig, drive_mode="phased")

@@ -2,11 +2,11 @@
 
     python -m benchmarks.latency [--touches N] [--report]
 
-The daemon, the floods of clients and the programs that load the machine are processes of their own.
-This process is the panel, and the amplifiers behind serial servers. The next touch is sent when the
-set of the last one has arrived and no other set is under way, so each set answers its own touch; a
-case with a planted delay proves that the delay appears. On a machine with other load, which the
-last column states in processors, the figures are upper bounds. It takes six minutes.
+The daemon, the floods of clients and the programs that load the machine are separate processes.
+This process simulates the panel, and the amplifiers behind serial servers. The next touch is sent
+when the set for the last touch has arrived and no other set is being sent, so each set belongs to
+its own touch. A case with a planted delay proves that the delay is measured. If the machine has
+other load (last column, in processors), the figures are upper bounds. It takes six minutes.
 
 --report writes the section Latency of docs/measured/figures.md.
 """
@@ -55,7 +55,7 @@ _SETTLING = 1.0  # s
 
 @asynccontextmanager
 async def floods(path: Path, *kinds: tuple[str, int]) -> AsyncIterator[None]:
-    """Flood the daemon at a socket while this lasts."""
+    """Flood the daemon at a socket during a `with` block."""
     async with AsyncExitStack() as stack:
         for kind, count in kinds:
             command = (sys.executable, "-P", _FLOODS, kind, path, count)
@@ -66,7 +66,7 @@ async def floods(path: Path, *kinds: tuple[str, int]) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def computing(count: int) -> AsyncIterator[None]:
-    """Keep so many processors busy while this lasts."""
+    """Keep a number of processors busy during a `with` block."""
     async with AsyncExitStack() as stack:
         for _ in range(count):
             command = (sys.executable, "-c", "while True: sum(range(10_000))")
@@ -75,7 +75,7 @@ async def computing(count: int) -> AsyncIterator[None]:
 
 
 async def fresh_stops(session: Session, count: int) -> int:
-    """Return how many of so many new clients were served a stop."""
+    """Return how many of a number of new clients could stop the plate."""
     served = 0
     for _ in range(count):
         with suppress(RpcError, Unreachable):
@@ -86,7 +86,7 @@ async def fresh_stops(session: Session, count: int) -> int:
 
 
 async def round_trips(session: Session, count: int) -> np.ndarray:
-    """Return the times [s] of so many touches of the lease's holder, each until its response."""
+    """Return the times [s] from a touch by the client with the lease to the response."""
     assert session.era is not None
     times = []
     for number in range(count):
@@ -99,8 +99,8 @@ async def round_trips(session: Session, count: int) -> np.ndarray:
 
 
 async def stops(session: Session, count: int) -> np.ndarray:
-    """Return the times [s] of so many stops beside a finger, from the request of the lease's holder
-    to the last byte of the stop at the last amplifier; infinite for one that was not seen."""
+    """Return the times [s] from a stop request of the client with the lease to the last byte of the
+    stop at the last amplifier, while a finger rests; infinite for a stop that does not arrive."""
     era, far, times = session.era, session.far, []
     assert era is not None
     async with AsyncExitStack() as armed:
@@ -120,7 +120,7 @@ async def stops(session: Session, count: int) -> np.ndarray:
 
 
 async def _clear(era: AsyncClient) -> None:
-    """Clear a stop, once the daemon has done with it; raises TimeoutError."""
+    """Clear a stop when the daemon has finished it; raises TimeoutError."""
     async with asyncio.timeout(TIMEOUT):
         while True:
             with suppress(RpcError):
@@ -148,7 +148,7 @@ _FURTHER_COLUMNS = ("further", "rig", "measured", "other load")
 
 @dataclass(frozen=True)
 class Case:
-    """Taps on a rig by its name: by the plain program, two at a time, loaded, or delayed."""
+    """Taps on a named rig: with the plain program, two at a time, under load, or delayed."""
 
     rig: str
     is_plain: bool = False
@@ -158,7 +158,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """For the table."""
+        """Name in the table."""
         words = [self.rig]
         if self.is_plain:
             words.append("plain asyncio")
@@ -214,12 +214,12 @@ async def case_row(case: Case, count: int) -> str:
 
 
 async def moving(session: Session, touches: int) -> str:
-    """Return the processor time of ten moving fingers."""
+    """Return the processor time with ten moving fingers."""
     return await _processor(session, move_ten, touches / 30)
 
 
 async def resting(session: Session, touches: int) -> str:
-    """Return the processor time of one resting finger."""
+    """Return the processor time with a resting finger."""
     return await _processor(session, rest_one, touches / 30)
 
 

@@ -3,7 +3,7 @@
     python -m benchmarks.latency.plain URL ...
 
 python-osc reads the touch, its position selects a pre-encoded set, and the set is sent to every
-amplifier without waiting for a reply. Nothing is checked, no finger is kept quiet. Prints the UDP
+amplifier without waiting for a reply. It checks nothing and keeps no finger quiet. Prints the UDP
 port.
 """
 
@@ -56,7 +56,7 @@ class Panel(asyncio.DatagramProtocol):
 
 
 def _sets() -> Iterator[Values]:
-    """The values of Set messages that play at once, each at a frequency of its own."""
+    """Yield values of Set messages that play immediately, each at its own frequency."""
     level = QUANTITIES["level"].to_wire(LEVEL)
     for number in range(SETS):
         frequency = QUANTITIES["frequency"].to_wire(110.0 + number % 50)

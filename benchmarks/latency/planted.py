@@ -1,6 +1,6 @@
 """`era daemon` that sleeps before it reads each frame of touches: `planted SECONDS CONFIG`.
 
-The proof of the benchmark: just that time must appear in its figures.
+It validates the benchmark, whose figures must increase by exactly this time.
 """
 
 import sys

@@ -1,8 +1,8 @@
 """A daemon, or the baseline, on the lines of a rig, and a panel that touches it.
 
-The amplifiers are behind serial servers, with a clock for what reaches them. They and the panel
-would not use the daemon's processors: the program that represents them has the highest priority.
-The daemon has that of `examples/systemd`, floods the ordinary one.
+The amplifiers are behind serial servers that record arrival times. Real amplifiers and a real panel
+would not use the daemon's processors, so the program that simulates them has the highest priority.
+The daemon has the priority of `examples/systemd`; floods have the ordinary priority.
 """
 
 import asyncio
@@ -51,9 +51,9 @@ class Vibration:
 class _Server:
     """A serial server of this machine for one host.
 
-    Not a pseudo-terminal: its bytes are carried by a thread of the kernel, of ordinary priority,
-    which on a busy machine has no processor for as long as a watchdog lasts, whatever the
-    priorities of the daemon and of this program.
+    A pseudo-terminal would not do: a kernel thread of ordinary priority carries its bytes. On a
+    busy machine this thread can wait longer than a watchdog, regardless of the priorities of the
+    daemon and of this program.
 
     on_data: called with bytes from the host, once `listen` was called.
     """
@@ -65,7 +65,7 @@ class _Server:
         self.url = f"serial+tcp://127.0.0.1:{self._listening.getsockname()[1]}"
 
     def listen(self) -> None:
-        """Accept a host from now on, in the running event loop."""
+        """Start to accept a host, in the running event loop."""
         self._listening.setblocking(False)
         asyncio.get_running_loop().add_reader(self._listening, self._accept)
 
@@ -148,7 +148,7 @@ class _Device:
         self._line.write(data)
 
     def _note(self, frame: Frame, now: float) -> None:
-        """Note the layers that a set drives, once it plays."""
+        """Record the layers that a set drives, when it starts to play."""
         _, values = decode_request(frame.kind, unpack_words(frame.payload))
         token = values["token"]
         if frame.kind == _SET:
@@ -196,13 +196,13 @@ class FarSide:
             each.close()
 
     def begin(self) -> None:
-        """Forget what has arrived."""
+        """Reset all records of arrived bytes."""
         for each in self._devices:
             each.vibrations.clear()
             each.stopped_at, each.bytes, each.used = 0.0, 0, 0.0
 
     def playing_since(self, count: int) -> float | None:
-        """Return when [s] the last amplifier had got sets of so many layers; None until then."""
+        """Return the time [s] at which the last amplifier got sets of `count` layers, else None."""
         found = []
         for each in self._devices:
             layers: frozenset[int] = frozenset()
@@ -214,20 +214,20 @@ class FarSide:
         return max(found) if len(found) == len(self._devices) else None
 
     def stopped_at(self) -> float | None:
-        """Return when [s] the last amplifier got a stop; None until then."""
+        """Return the time [s] at which the last amplifier got a stop, else None."""
         times = [each.stopped_at for each in self._devices]
         return max(times) if all(times) else None
 
     def sets(self) -> int:
-        """Return how many sets with vibrations have arrived, each on some amplifier."""
+        """Return the number of sets with vibrations that have arrived at any amplifier."""
         return len({one.token for each in self._devices for one in each.vibrations})
 
     def wire_time(self) -> float:
-        """Return how long [s] the busiest line would take for its bytes of sets and replies."""
+        """Return the transmission time [s] of sets and replies on the busiest line."""
         return max(each.bytes for each in self._devices) * BITS / BAUD
 
     def used(self) -> float:
-        """Return how long [s] this program took for what has arrived, in place of amplifiers."""
+        """Return the time [s] that this program spent on simulating the amplifiers."""
         return sum(each.used for each in self._devices)
 
     async def until(self, arrived: Callable[[], float | None], timeout: float) -> float | None:
@@ -243,28 +243,28 @@ class FarSide:
         return found
 
     async def quiet(self) -> None:
-        """Wait until no set is under way."""
+        """Wait until no set is being sent."""
         last = max(each.changed_at for each in self._devices)
         if (left := last + QUIET - time.monotonic()) > 0:
             await asyncio.sleep(left)
             await self.quiet()
 
 
-DAEMON_NICE = -10  # as in the unit
+DAEMON_NICE = -10  # like in the unit file
 TIMEOUT = 180.0  # s; a table may have to be built
 _STAT = Path("/proc/stat")
 _IDLE, _WAITING, _STOLEN = 3, 4, 7  # columns of /proc/stat's line of all processors, proc(5)
 
 _children: set[int] = set()  # process ids of running programs
-_ended = 0.0  # s; processor time of those that have ended
+_ended = 0.0  # s; processor time of ended programs
 
 
 class EndedEarly(Exception):
-    """A program of the benchmark has ended early, or does not get ready."""
+    """A program of the benchmark has ended early, or has not become ready."""
 
 
 def become_device() -> bool:
-    """Take the highest priority, which children do not inherit; False if that is not permitted."""
+    """Take the highest priority, not inherited by children; return False if not permitted."""
     try:
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(1))
@@ -277,7 +277,7 @@ def become_device() -> bool:
 async def running(
     *command: object, nice: int = 0, has_line: bool = True
 ) -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
-    """Run a program while this lasts; yields it and its first line of output.
+    """Run a program during a `with` block; yield it and its first line of output.
 
     Raises EndedEarly if it ends before that line.
     """
@@ -310,8 +310,8 @@ async def running(
 def _set_nice(process: int, nice: int) -> None:
     """Set the level of a process and of its session, as far as that is permitted.
 
-    Where sessions share the processors, the level of a process counts within its session only; that
-    of the session is as the unit's `CPUWeight=`.
+    If sessions share the processors, the level of a process counts only within its session. The
+    level of the session corresponds to `CPUWeight=` of a unit.
     """
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, process, nice)
@@ -361,11 +361,11 @@ def busy_ticks(line: str) -> int:
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DAEMON = (sys.executable, "-m", "controller.cli", "daemon")
-RESTING = Touch(1, 0.25, 0.3)  # the quiet finger beside taps
+RESTING = Touch(1, 0.25, 0.3)  # the quiet finger during taps
 UNANSWERED = 0.5  # s
 _APART = 0.05  # m; between fingers
 _EDGE = 0.06  # of the sensor
-_ARMING = 1.0  # s; until what follows arming is over
+_ARMING = 1.0  # s; until the activity after arming has ended
 _TWO_HALVES = """regions:
   west: {{rectangle: {{start: [0 m, 0 m], end: [{middle} m, {plate.width} m]}}, on_press: buzz}}
   east:
@@ -388,7 +388,7 @@ class Session:
     frames: int = 0
 
     def touch(self, *touches: Touch) -> float:
-        """Send a frame; returns when [s], just before."""
+        """Send a frame; return the time [s] just before."""
         self.frames += 1
         datagram = tuio_datagram(TouchFrame("bench", 0.0, touches), self.frames)
         sent_at = time.monotonic()
@@ -403,7 +403,7 @@ async def daemon_session(
     program: Sequence[object] = DAEMON,
     is_two: bool = False,
 ) -> AsyncIterator[Session]:
-    """Run and arm a daemon for a rig of the examples; is_two: each half of it has a content."""
+    """Run and arm a daemon for an example rig; is_two: whether each half has its own content."""
     with TemporaryDirectory(prefix="era-latency-") as name:
         folder, port = Path(name), _free_port()
         rig, far = _rig_on_lines(rig_name, folder)
@@ -452,10 +452,10 @@ async def plain_session(rig_name: str) -> AsyncIterator[Session]:
 
 @dataclass(frozen=True)
 class Taps:
-    """Times [s] from touch to wire; unanswered: touches without a set; sets: that came in all.
+    """Times [s] from touch to wire; unanswered: touches without a set; sets: total number.
 
-    wire, in_amplifiers [s]: medians of what the busiest line would take, and of what this program
-    took in place of amplifiers.
+    wire, in_amplifiers [s]: medians of the transmission time on the busiest line, and of the time
+    of the simulated amplifiers.
     """
 
     times: np.ndarray
@@ -466,9 +466,9 @@ class Taps:
 
 
 async def taps(session: Session, count: int, *, is_two: bool = False, seed: int = 1) -> Taps:
-    """Tap so often in random places, each when the set of the one before has come.
+    """Tap at random positions; each tap follows the set for the previous tap.
 
-    A new finger beside one that rests; is_two: one in each half.
+    A new finger touches while another one rests; is_two: a finger in each half.
     """
     rng = random.Random(seed)
     far, sets = session.far, 0
@@ -512,7 +512,7 @@ async def rest_one(session: Session, seconds: float, rate: float = 20.0) -> None
 
 
 def _fingers(rng: random.Random, rig: Rig, number: int, *, is_two: bool) -> tuple[Touch, Touch]:
-    """The fingers of a tap, the newest last."""
+    """Return the fingers of a tap, the newest last."""
     while True:
         x, y = (rng.uniform(_EDGE, 1 - _EDGE) for _ in range(2))
         first, second = RESTING, Touch(2 * number + 3, x, y)
@@ -547,7 +547,7 @@ async def _client(path: Path, process: asyncio.subprocess.Process) -> AsyncClien
                 await asyncio.sleep(0.05)
             return client
         await asyncio.sleep(0.1)
-    raise EndedEarly("the daemon was not ready; its log says why")
+    raise EndedEarly("the daemon was not ready; its log has the reason")
 
 
 def _panel(port: int) -> socket.socket:

@@ -1,1 +1,1 @@
-"""Speed and accuracy of the plate model beside other programs."""
+"""Speed and accuracy of the plate model, compared with other programs."""

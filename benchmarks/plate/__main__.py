@@ -2,9 +2,9 @@
 
     python -m benchmarks.plate [--runs 5] [--report]
 
-From nothing to the responses at 27 frequencies and 20 points; all settings take turns in one
-process. Prints the table in the section Speed of the plate model of docs/measured/figures.md;
---report writes it there. Needs the extras group `peers`.
+Measures the whole solution, up to the responses at 27 frequencies and 20 points; all settings take
+turns in a process. Prints the table in the section Speed of the plate model of
+docs/measured/figures.md; --report writes it there. Needs the extras group `peers`.
 """
 
 import argparse

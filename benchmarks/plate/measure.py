@@ -1,4 +1,4 @@
-"""Errors and times of programs: processor time on one thread, all programs in turns."""
+"""Errors and times of programs: processor time on a single thread, all programs in turn."""
 
 import os
 import platform
@@ -14,7 +14,7 @@ from benchmarks.plate.peers.ways import Direct
 from benchmarks.plate.problem import CORNERS, OTHERS, Case, difference
 from benchmarks.plate.programs import CASES, Setting, reference, settings
 
-SLOW = 0.3  # s; a setting that takes longer is measured in the first rounds alone
+SLOW = 0.3  # s; a setting that takes longer is measured in the first rounds only
 SLOW_ROUNDS = 3
 PACKAGES = ("numpy", "scipy", "ngsolve")
 
@@ -29,7 +29,7 @@ class Measured:
 
     @property
     def seconds(self) -> float:
-        """Median time from nothing to the responses of one layout."""
+        """Median time for the whole solution, up to the responses of a layout."""
         return statistics.median(self.times)
 
 
@@ -73,7 +73,7 @@ def report(measured: Mapping[Case, Sequence[Measured]]) -> str:
 
 
 def _quickest(results: Sequence[Measured], accuracy: float) -> Measured | None:
-    """Return the quickest result with an error of at most an accuracy [%]."""
+    """Return the quickest result whose error is at most `accuracy` [%]."""
     accurate = [each for each in results if 100 * each.error <= accuracy]
     return min(accurate, key=lambda result: result.seconds, default=None)
 

@@ -1,4 +1,4 @@
-"""What every program solves: a free plate on four ERAs, 27 frequencies, each ERA driven alone."""
+"""Problem for all programs: a free plate on four ERAs, 27 frequencies, each ERA driven alone."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)
 GLASS = Material("glass", E=72e9, rho=2500.0, nu=0.23)
 
 STIFFNESS, DAMPING, STROKE = 17000.0, 3.4631, 1e-4
-"""Of each ERA, those of the paper's plate: N/m, N s/m, m."""
+"""Values of each ERA on the paper's plate [N/m, N s/m, m]."""
 
 CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-"""Places as shares of the plate's sides."""
+"""Positions as fractions of the plate's sides."""
 
 OTHERS = (
     np.array([(0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.0, 0.75)]),
     np.array([(0.3, 0.0), (0.61, 1.0), (0.0, 0.44), (1.0, 0.72)]),
     np.array([(0.13, 0.18), (0.82, 0.31), (0.57, 0.86), (0.22, 0.66)]),
 )
-"""Further layouts, with places inside and on edges, at which errors are measured too."""
+"""Further layouts, with positions inside and on edges, for errors."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Case:
 
     @property
     def points(self) -> FloatArray:
-        """Twenty points (20, 2) [m] at which the acceleration is asked for."""
+        """Twenty points (20, 2) [m] at which the acceleration is computed."""
         shares = np.random.default_rng(1).uniform(0.03, 0.97, (20, 2))
         return np.asarray(shares * [self.plate.length, self.plate.width])
 

@@ -1,4 +1,4 @@
-"""Programs with the settings that are measured, from coarse to fine.
+"""Programs with their measured settings, from coarse to fine.
 
 Settings of the peer were chosen by trial on the paper's plate, among orders 3 to 10, one to eight
 elements a side, strips of 0 to 5 mm and 12 to 60 modes. era-haptics
@@ -65,7 +65,7 @@ def eras_at(case: Case, shares: FloatArray) -> list[Era]:
 
 
 def forget() -> None:
-    """Forget what is kept from one plate to the next: integrals of one dimension, weights."""
+    """Clear caches that plates share: one-dimensional integrals, weights."""
     for module in (polynomials, free_plate):
         for kept in vars(module).values():
             if hasattr(kept, "cache_clear"):
@@ -90,14 +90,14 @@ _MODES: dict[Case, list[tuple[int, int, int, tuple[int, ...], int]]] = {
 _DIRECT: dict[Case, list[tuple[int, int, int, tuple[int, ...]]]] = {
     PAPER: [(4, 3, 3, (8,)), (5, 2, 2, (8,)), (6, 2, 2, (8,)), (6, 4, 4, (8,)), (6, 6, 5, (8,))],
 }
-# On larger plates more elements: 8x8 leave an error of 1 % inside the car's glass, since a force
-# dents it more sharply than they resolve.
+# Larger plates need more elements: 8x8 have an error of 1 % inside the car's glass, because they do
+# not resolve the local deflection under a force.
 _REFERENCE = (6, 8, 8, (1.4, 3, 8))
 _REFERENCES = {CAR: (6, 18, 10, (1.4, 3, 8)), TABLE: (6, 14, 10, (1.4, 3, 8))}
 
 
 class Solved(Protocol):
-    """A plate that was solved, or of which there are matrices."""
+    """A solved plate, or a plate with its matrices."""
 
     def sweep(self, shares: FloatArray) -> ComplexArray:
         """Acceleration (f, eras, p) with ERAs at shares (n, 2) of the sides."""
@@ -108,7 +108,7 @@ class Solved(Protocol):
 
 @dataclass(frozen=True)
 class Setting:
-    """One program in one way with one mesh; solve begins with nothing."""
+    """A program with a method and a mesh; `solve` starts without any cached result."""
 
     program: str
     way: str
@@ -117,12 +117,12 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Program and way."""
+        """Program and method."""
         return f"{self.program}, {self.way}" if self.way else self.program
 
 
 def settings(case: Case) -> list[Setting]:
-    """All that is measured on a case, ours first."""
+    """Return all settings for a case, era-haptics first."""
 
     def by_us(accuracy: float) -> Setting:
         def solve() -> Solved:
@@ -157,7 +157,7 @@ def settings(case: Case) -> list[Setting]:
 
 
 def reference(case: Case) -> Direct:
-    """The graded reference."""
+    """Return the reference, with graded strips."""
     elements = _elements(case, *_REFERENCES.get(case, _REFERENCE))
     return Direct(case, _matrices(case, elements))
 

@@ -1,1 +1,1 @@
-"""What answers give at the skin on plates that deviate, beside an independent optimum."""
+"""Vibration at the skin on plates within the tolerances, compared with promises."""

@@ -3,15 +3,15 @@
     python -m benchmarks.promise [--cases 1,2] [--plates 60] [--first 0] [--workers 2]
     python -m benchmarks.promise contents|clicks|everyday|weather [--sets N] [--plates N]
 
-Without a word: sessions through the complete signal chain, by the numbers of their cases. Each has
-a plate, ERAs, drives and fingertips of its own, drawn within the uncertainty of the rig; --first is
-the seed of the first plate, and cases with events, which take ten times as long, have a quarter of
-the plates. Control loop, serial lines and amplifiers run in virtual time, and the plate in time
-under the fingers. Exits with status 1 unless 80 to 98 % of the promises are kept, of default and of
-identified rigs each.
+Without a subcommand, it runs sessions through the complete signal chain, by case number. Each
+session has its own plate, ERAs, drives and fingertips, drawn within the uncertainty of the rig.
+--first is the seed of the first plate. Cases with events, which take ten times as long, use a
+quarter of the plates. Control loop, serial lines and amplifiers run in virtual time, and the plate
+is simulated in time under the fingers. Exits with status 1 unless 80 to 98 % of the promises are
+kept, both of default and of identified rigs.
 
 contents: by number of ERAs. clicks: without the wire. everyday: hands, force, objects and people;
---only WORD ... selects rows. weather: after its change.
+--only WORD ... selects rows. weather: after a change of weather.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from benchmarks.promise.report import as_markdown, kept
 from benchmarks.promise.session import Outcome, outcome
 
 QUARTER = 4
-"""Part of the plates for cases with events."""
+"""Divisor of the number of plates for cases with events."""
 
 
 def main() -> None:
@@ -64,7 +64,7 @@ def main() -> None:
 def sessions(
     numbers: Sequence[int], plates: int, first: int, workers: int
 ) -> dict[int, list[Outcome]]:
-    """Run sessions of some cases in processes of their own."""
+    """Run sessions of some cases in separate processes."""
     outcomes: dict[int, list[Outcome]] = {number: [] for number in numbers}
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         jobs = []

@@ -24,11 +24,11 @@ IDENTIFIED = Uncertainty(
     **Uncertainty.of_frequency(0.002),
     place=0.0003,
 )
-"""As after `era rig identify`; harmonics are those of any rig."""
+"""Uncertainty after `era rig identify`; harmonics have their default."""
 
 JOINS, CHANGES, LEAVES, MOVES = "joins", "changes", "leaves", "moves"
 HELD, RESTING = 3.0, 5.0  # s
-"""Times for reading clocks: before any finger comes, and while fingers rest."""
+"""Times for reading clocks: before the first finger, and while fingers rest."""
 
 Band = tuple[float, float]
 Point = tuple[float, float]
@@ -36,7 +36,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Case:
-    """Fingers with contents, then quiet ones, on a rig of the examples.
+    """Fingers with contents and quiet fingers, on an example rig.
 
     bands [Hz]: of the contents in order, any band if empty; may_swap: in any order. modulation_hz:
     of the last content. events: actions of the last finger with a content, once all contents play.

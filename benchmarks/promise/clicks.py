@@ -1,9 +1,9 @@
 """Promises to clicks on plates that vibrate in time: `python -m benchmarks.promise clicks`.
 
-Clicks of 40 ms and 20 dB SL along plain ramps, with one to three quiet fingers anywhere on the
-plate, 5 cm apart; other plates for each set, drawn within the uncertainty. Contrast over the click:
-at the target over its duration, at the loudest quiet point the strongest part as long, ringing
-included. Each cell has the median of the promises and the share of plates that keep them.
+Clicks of 40 ms and 20 dB SL with plain ramps, and one to three quiet fingers at random positions,
+5 cm apart. Each set has its own plates, drawn within the uncertainty. The contrast is the level at
+the target over the click, relative to the strongest part of equal duration at the loudest quiet
+point, including ringing. Each cell has the median promise and the share of plates that keep it.
 """
 
 import math
@@ -58,7 +58,7 @@ def _promised_and_kept(rig: Rig, sets: int, plates: int) -> str:
 
 
 def clicks_on(table: LocalizationTable, sets: int, seed: int) -> list[Answer]:
-    """What is played for a click with one to three quiet fingers in turn."""
+    """Return the answers for clicks with one to three quiet fingers in turn."""
     rng, found = np.random.default_rng(seed), []
     for number in range(sets):
         places = random_contacts(rng, 2 + number % 3, table.plate, margin=0.013)
@@ -70,10 +70,10 @@ def clicks_on(table: LocalizationTable, sets: int, seed: int) -> list[Answer]:
 def given(
     table: LocalizationTable, rig: Rig, answers: Sequence[Answer], plates: int, seed: int
 ) -> FloatArray:
-    """Contrast [dB] of the first finger on plates that differ from a rig's within its uncertainty.
+    """Return the contrast (a, plates) [dB] of the first finger on plates within an uncertainty.
 
-    Of each answer (a, plates): its level above the others' content at it, or of an only content
-    above what is felt of it at the loudest other finger.
+    For each answer: the level of its content relative to all others, or, for a single content,
+    relative to its level at the loudest other finger.
     """
     found = np.empty((len(answers), plates))
     for number, drawn in enumerate(_drawn_plates(table, rig, plates, seed)):
@@ -87,7 +87,7 @@ def given(
 def _drawn_plates(
     table: LocalizationTable, rig: Rig, plates: int, seed: int
 ) -> Iterator[tuple[LocalizationTable, ComplexArray, ComplexArray]]:
-    """The table of each plate, and gains and second harmonics of its drives (eras,)."""
+    """Yield the table of each plate, and gains and second harmonics of its drives (eras,)."""
     drawn = draw_plates(
         np.random.default_rng(seed),
         rig.uncertainty,
@@ -123,10 +123,10 @@ def _drawn_plates(
 
 
 def _table_on(table: LocalizationTable, rig: Rig) -> LocalizationTable:
-    """A table for a rig that differs a little from its own, without building it.
+    """Return a table for a slightly different rig without building it.
 
-    Modulus and thickness scale the modes of the table. Moved ERAs act where the raster gives their
-    shapes; masses and ERAs at their former positions keep the shapes that were built.
+    Modulus and thickness scale the modes of the table. Shapes at moved ERAs are interpolated on the
+    sampling grid; masses and other ERAs keep their shapes.
     """
     thicker = rig.plate.thickness / table.plate.thickness
     faster = thicker * np.sqrt(rig.plate.material.E / table.plate.material.E)
@@ -156,9 +156,10 @@ def _felt_on(
     answer: Answer,
     number: int,
 ) -> tuple[float, FloatArray]:
-    """Power to threshold of a layer at its first finger, and at the loudest points of all (k,).
+    """Return the power to threshold of a layer at its first finger, and at all loudest points (k,).
 
-    In time: over a duration, or at the strongest moments of a course; of what lasts the steady one.
+    It is evaluated over the duration, at the strongest moments of a course, or in the steady state
+    of a continuous layer.
     """
     contents, power = answer.contents, 0.0
     steady = RingingUnderFingers(

@@ -70,7 +70,7 @@ def _row(table: LocalizationTable, contents: int, quiet: int, sets: int, *, apar
         )
         times.append(1e3 * (time.process_time() - begin))
         asked.append((best, positions[contents:]))
-    # Judged afterwards: a live answer follows another one.
+    # Evaluated afterwards, because live answers follow each other.
     promises = [promised_worst(best) for best, _ in asked]
     kept = [share_kept(table, *each, seed=number) for number, each in enumerate(asked)]
     promised = f"{np.median(promises):.1f} ({np.percentile(promises, 10):.1f})"

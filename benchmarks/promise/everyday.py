@@ -33,7 +33,7 @@ from model.vibration import Excitation, base_amplitudes
 OBJECT_AWAY = 0.03  # m
 PATCH = 0.0125  # m; of a patch of the heel from its middle, along x and along y
 OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
-"""Thresholds of pressing fingers above those of the probe, by frequency [Hz] in dB."""
+"""Thresholds of pressing fingers relative to the probe's, by frequency [Hz] in dB."""
 STUDIED = (40.0, 100.0, 250.0, 500.0)
 """Frequencies [Hz] at which a person differs from the mean independently, by 4 dB."""
 OH_CHOI, DRAWN = "Oh and Choi", "drawn"
@@ -90,7 +90,7 @@ def situations() -> Iterator[Situation]:
 
 
 def run(sets: int, plates: int, words: Sequence[str]) -> None:
-    """Print the rows with one of some words in their names."""
+    """Print the rows whose names contain any of the words."""
     cases = [Case("", rig, is_identified=is_identified) for rig, is_identified in RIGS]
     print(f"| {' | '.join(['', *(case.title.lstrip(', ') for case in cases)])} |")
     print("|---" * (1 + len(cases)) + "|")

@@ -1,9 +1,9 @@
 """Levels that fingers feel in a session, separately for each content.
 
-A log notes all changes on a bench: fingers, voices of the drives, and the owners of layers. Played
-again on the same plate under the same fingers with the voices of some contents only, it gives the
-levels of these contents. Voices are divided by the detection threshold at their frequency, for each
-set of thresholds of the rig, so that accelerations are levels of sensation.
+A log records all changes on a bench: fingers, voices of the drives, and the owners of layers. It is
+replayed on the same plate under the same fingers with the voices of some contents only, which gives
+the levels of these contents. Voices are divided by the detection threshold at their frequency, for
+each threshold set of the rig, so that accelerations are sensation levels.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ from sim.plant.finger_placement import FingerPlacement
 from sim.plant.imperfections import Imperfections
 
 STRONGEST = 0.040  # s; of the strongest part of a span
-EARLY = 0.020  # s; by which amplifiers may start before another
+EARLY = 0.020  # s; by which amplifiers can start earlier than others
 
 Span = tuple[float, float]
 Owners = Callable[[int | None], bool]

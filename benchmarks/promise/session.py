@@ -1,8 +1,8 @@
 """One session of a case on a plate of its own: promised and felt contrast of its fingers.
 
 Control loop, serial lines and amplifiers run in virtual time, and the plate vibrates in time under
-the fingers. A click has a content of its own at its finger. All levels are those of 40 ms: of a
-click over its duration, of other contents the strongest while it plays and rings.
+the fingers. A click has its own content at its finger. All levels are averages over 40 ms: over the
+duration of a click, and over the strongest part of other contents while it plays and rings.
 """
 
 import asyncio
@@ -151,7 +151,7 @@ def _timing(number: int) -> Timing:
 
 
 def outcome(number: int, seed: int) -> Outcome:
-    """Run a case by its number on the plate of a seed."""
+    """Run the case with a number on the plate of a seed."""
     return on_plate(CASES[number], _timing(number), seed)
 
 
@@ -312,7 +312,7 @@ class _Session:
         return low, frequency - 30
 
     def _way(self, at: Mapping[int, Point]) -> list[Point]:
-        """Return the way that leaves most room to other fingers and edges."""
+        """Return the path farthest from other fingers and edges."""
         x, y = at[self._last]
         others = [position for id, position in at.items() if id != self._last]
         lengths = np.arange(1, round(WAY / SPEED / STEP) + 1) * SPEED * STEP
@@ -322,7 +322,7 @@ class _Session:
         return max(ways, key=lambda way: self._room(way, others))
 
     def _room(self, way: Sequence[Point], others: Sequence[Point]) -> float:
-        """Return the least distance [m] of a way from other fingers, -1 if it leaves the plate."""
+        """Return the least distance [m] of a path from other fingers, -1 if it leaves the plate."""
         plate, edge = self._rig.plate, FINGERTIP_RADIUS + 0.001
         x, y = way[-1]
         if not (edge <= x <= plate.length - edge and edge <= y <= plate.width - edge):

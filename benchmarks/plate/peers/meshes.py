@@ -1,4 +1,4 @@
-"""Meshes of peers: elements of one order, uniform but for strips along the edges."""
+"""Meshes of peers: elements of equal order, uniform except for strips along the edges."""
 
 from dataclasses import dataclass
 

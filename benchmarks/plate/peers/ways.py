@@ -1,4 +1,4 @@
-"""The two ways in which peers sweep: a factor per frequency, and modes with a kept factor."""
+"""Two methods of peers for a sweep: a factorization per frequency, or modes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.structure.footprints import mean_over
 
 TOLERANCE = 1e-6
-"""Of the eigenvalues, relative."""
+"""Relative tolerance of the eigenvalues."""
 
 
 class Matrices(Protocol):
@@ -72,10 +72,10 @@ class Direct:
 
 
 class Modes:
-    """Modes of the free plate, and the truncated ones by two static solves a place.
+    """Modes of the free plate; two static solves per position for truncated modes.
 
-    The factor of K + shift M serves the modes and the static solves. Truncated modes are the first
-    two terms of 1 / (lambda - z) about z = -shift.
+    The factor of K + shift M is used for the modes and the static solves. Truncated modes are the
+    first two terms of 1 / (lambda - z) about z = -shift.
     """
 
     way = "modes, kept factor"

@@ -9,9 +9,9 @@ on the rig's value. Its class defines
 - `value`: the value of the rig that they represent;
 - `derivative`: the derivatives of the plate's responses with respect to them.
 
-To add a kind, write a class and add it to `ALL_KINDS`. `jacobian` collects the derivatives of all
-kinds. `tests/model/estimate/test_identify.py`
-compares every derivative with a difference quotient.
+To add a kind, write a class, add it to `ALL_KINDS`, and use its value (`values[name]`) in
+`model.estimate.forward`. `jacobian` collects the derivatives of all kinds.
+`tests/model/estimate/test_identify.py` compares every derivative with a difference quotient.
 """
 
 import math

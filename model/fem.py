@@ -311,9 +311,9 @@ class _EnergyTerm(NamedTuple):
     fields: str
     """Fields of rows and columns."""
     rigidity: str
-    """Rigidity by which the integrals are multiplied."""
+    """Rigidity that multiplies the integrals."""
     along_x: str
-    """Integral along x, as in `ElementRow.integrals`."""
+    """Integral along x, a key of `ElementRow.integrals`."""
     along_y: str
     sign: int = 1
 

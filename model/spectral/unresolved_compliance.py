@@ -27,7 +27,7 @@ times the infinite plate's compliance. This is the solution (A + B y) exp(-k y) 
 equation without bending moment and Kirchhoff's shear force at the edge (Timoshenko and
 Woinowsky-Krieger, Theory of Plates and Shells, 2nd ed., art. 22, free edge), added to the infinite
 plate's (1 + |y - d| k) exp(-k |y - d|). Here it is averaged over all k above a or b. In shear an
-edge is a mirror, and doubles the compliance. A corner has the images in both edges.
+edge is a mirror and doubles the compliance. A corner has images in both edges.
 
 The shear part has no limit for a point and is cut off at k_max = 1 / h: plate theory does not hold
 on a shorter scale. A disc limits it by itself.

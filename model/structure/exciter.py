@@ -142,7 +142,7 @@ class Exciter(Source):
         return spring * share - w**2 * self.coil_mass, np.asarray(by_voltage)
 
     def base(self, omega: FloatArray) -> ComplexArray:
-        """Motion Bl V / (Z omega² M) [m] at full level, by which spring errors change the force.
+        """Motion Bl V / (Z omega² M) [m] at full level.
 
         A spring that is stiffer by dS adds the force dS T² (base - w). 0 if a frame holds the
         magnet.

@@ -165,7 +165,7 @@ From the Wood Handbook FPL-GTR-282, table 4-2.
 """
 
 VENEER = 1.4e-3  # m, of each veneer
-_SANDED = 0.6e-3  # m, by which sanding makes a board thinner
+_SANDED = 0.6e-3  # m; sanding makes a board thinner
 
 
 def plies(thickness: float) -> int:
@@ -180,7 +180,7 @@ def plywood(thickness: float) -> Material:
     """
     count = plies(thickness)
     board = VENEER * count - _SANDED  # m, the thickness of boards with this count
-    sign = 1 if count % 4 == 3 else -1  # 1 if the middle veneer lies across
+    sign = 1 if count % 4 == 3 else -1  # 1 if the middle veneer is a cross ply
     across = 0.0
     for number in range((count - 1) // 2):
         height = VENEER * (number + 0.5)  # from the middle, where the grain turns

@@ -42,6 +42,7 @@ from model.estimate.parameter_space import PlateValues, Space
 from model.reduction.attachment_points import AttachmentPoints, Modes, places_of
 from model.reduction.form_modes import ReducedModes
 from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
+from model.reduction.point_cache import PointCache
 from model.rig.rig import Rig
 from model.structure.attachments import attached_stiffness, coupled_forces, footprints_of
 from model.structure.exciter import Actuator
@@ -204,12 +205,18 @@ class ForwardModel:
         shapes, since positions can leave the plate. Other plates are solved at the positions.
         """
         footprints = self._footprints(values)
-        nominal = self._nominal_attachments
         if self.form is not None:
-            return nominal.moved(footprints, self.movable)
-        if np.array_equal(footprints, nominal.footprints):
-            return nominal
-        return places_of(self.modes, footprints, self.movable, self.sides)
+            return self._nominal_attachments.moved(footprints, self.movable)
+        located = self._latest_attachments.get(footprints)
+        if located is None:
+            located = places_of(self.modes, footprints, self.movable, self.sides)
+            self._latest_attachments.put(footprints, located)
+        return located
+
+    @cached_property
+    def _latest_attachments(self) -> PointCache[AttachmentPoints]:
+        """Shapes of the modes at the positions that were used last."""
+        return PointCache(1)
 
     @cached_property
     def _nominal_attachments(self) -> AttachmentPoints:

@@ -31,7 +31,7 @@ LATER = 4_000_000_000  # s; a time of change after those of all files of the pro
 
 # Of the sources: what is neither a program nor made by one.
 DATA = re.compile(
-    r"\.(c|h|pyi?|typed|yaml|csv|json|ahap|haptic|hjif|js|css|html|svg|service|rules|conf)$"
+    r"\.(c|h|pyi?|typed|yaml|csv|json|ahap|haptic|hjif|js|css|html|svg|service|rules|conf|toml)$"
 )
 
 

@@ -47,7 +47,7 @@ PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
     "fact",
     [
         "Raises ConfigError with all problems of the file; InputError for",  # errors of a function
-        "slew [1/s]: highest rise of a level;",  # units of a class's fields
+        "`slew: float`: Maximum rise of a channel's level [1/s].",  # units of a class's fields
         "Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m]",  # shapes
         "- `disarm() -> None`: Fall silent, then switch the high voltage off.",  # a method
         "- `is_reached: bool`: Whether all vibrations have their nominal levels",  # a property

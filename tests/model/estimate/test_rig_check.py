@@ -436,7 +436,7 @@ def test_commands_say_why_they_write_no_rig(
     assert run_era(command.format(rig=rig, file=file, made=made).split()) == status
     said = "".join(capsys.readouterr())
     if is_dead:
-        assert "SW did not; no rig is written. Find out why by era rig check" in said
+        assert "SW did not; no rig is written. Find the cause with era rig check" in said
         assert "Next:" not in said
     else:
         assert "plate.grain must be width, got length" in said

@@ -261,7 +261,7 @@ def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misrea
     assert "at 44 Hz" in misread
     assert not [each for each in others if "start at" in each]
     (narrow,) = warned("type: DAEX13-4SM, power: 1 mW", "[50, 57]")
-    assert narrow.endswith("plate; identify the rig")
+    assert narrow.endswith("plate alike; identify the rig")
     assert not [each for each in warned(f"{OWN}, stiffness: 3190", "[100, 300]") if "high" in each]
 
 

@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import socket
 import subprocess
 import threading
@@ -397,18 +398,28 @@ def http(
 
 
 def raw(gateway: GatewayProcess, data: bytes, *, timeout: float = PATIENCE) -> HttpResponse:
-    """Send bytes; the response until the gateway closes."""
+    """Send bytes; return the first response, or what comes until the gateway closes."""
     with gateway.connect(timeout) as connection:
         received = b""
         # It may close before it has received everything.
         with contextlib.suppress(ConnectionError):
             connection.sendall(data)
         with contextlib.suppress(ConnectionError):
-            while part := connection.recv(1 << 16):
+            while not _has_body(received):
+                part = connection.recv(1 << 16)
+                if not part:
+                    break
                 received += part
-    head, _, rest = received.partition(b"\r\n\r\n")
+    head, _, body = received.partition(b"\r\n\r\n")
     status = head[9:12]
-    return HttpResponse(int(status) if status.isdigit() else 0, head.decode("latin-1"), rest)
+    return HttpResponse(int(status) if status.isdigit() else 0, head.decode("latin-1"), body)
+
+
+def _has_body(received: bytes) -> bool:
+    """Return whether bytes are a response that states its length and has it."""
+    head, _, body = received.partition(b"\r\n\r\n")
+    stated = re.search(rb"\r\nContent-Length: (\d+)", head)
+    return stated is not None and len(body) >= int(stated[1])
 
 
 def upgrade(

@@ -143,11 +143,12 @@ def changed_texts(fault: PlantedFault, tree: Path) -> dict[str, str]:
 
 
 def stale_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
-    """Describe each fault that cannot be planted in a tree: where, why, and what to do."""
+    """Describe each fault that cannot be planted in a tree, or whose code has undefined names."""
     reports = []
+    changed = []
     for fault in faults:
         try:
-            changed_texts(fault, tree)
+            changed.append((fault, changed_texts(fault, tree)))
         except StaleEdit as error:
             reason = "\n    ".join(str(error).splitlines())
             reports.append(
@@ -157,7 +158,25 @@ def stale_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
                 f"    {fault.behaviour}\n"
                 f"    Then: python tests/faults/run.py --only {fault.name}"
             )
-    return reports
+    return reports + _undefined_names(changed)
+
+
+def _undefined_names(changed: Iterable[tuple[PlantedFault, Mapping[str, str]]]) -> list[str]:
+    """Describe each undefined name in the files that faults change, as ruff finds it."""
+    described = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for fault, texts in changed:
+            for file, text in texts.items():
+                if file.endswith(".py"):
+                    path = folder / f"{len(described)}.py"
+                    path.write_text(text, "utf-8")
+                    described[str(path)] = f"{fault.source}: fault {fault.name}: {file}"
+        command = [sys.executable, "-m", "ruff", "check", "--isolated", "--no-cache"]
+        command += ["--select", "F821", "--output-format", "json", name]
+        completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    findings = json.loads(completed.stdout)
+    return [f"{described[finding['filename']]}: {finding['message']}" for finding in findings]
 
 
 def missing_tests_report(faults: Iterable[PlantedFault], existing: set[str]) -> list[str]:
@@ -187,24 +206,6 @@ def missing_imports(faults: Iterable[PlantedFault]) -> list[str]:
                 except ImportError as error:
                     reports.append(f"{fault.source}: fault {fault.name}: {line}: {error}")
     return reports
-
-
-def undefined_names_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
-    """Describe each undefined name in the code of a fault, as ruff finds it in the changed file."""
-    described = {}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for fault in faults:
-            for file, text in changed_texts(fault, tree).items():
-                if file.endswith(".py"):
-                    path = folder / f"{len(described)}.py"
-                    path.write_text(text, "utf-8")
-                    described[str(path)] = f"{fault.source}: fault {fault.name}: {file}"
-        command = [sys.executable, "-m", "ruff", "check", "--isolated", "--no-cache"]
-        command += ["--select", "F821", "--output-format", "json", name]
-        completed = subprocess.run(command, capture_output=True, text=True, check=False)
-    findings = json.loads(completed.stdout)
-    return [f"{described[finding['filename']]}: {finding['message']}" for finding in findings]
 
 
 def _concerns(fault: PlantedFault, files: Sequence[str]) -> bool:
@@ -296,7 +297,7 @@ def main() -> int:
         return 0
     if options.check is not None:
         selected = [fault for fault in faults if _concerns(fault, options.check)]
-        reports = stale_report(selected, ROOT) or undefined_names_report(selected, ROOT)
+        reports = stale_report(selected, ROOT)
         sys.stdout.writelines(f"{report}\n" for report in reports)
         return 1 if reports else 0
     prepare(are_many=len(faults) > _MANY)

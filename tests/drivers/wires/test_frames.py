@@ -35,40 +35,26 @@ PART: Values = {
 REPLY: Values = {"token": 0x0102, "exact": 1, "staged": 0, "played": 1, "missing": 0}
 
 
-def can_bytes(*frames: str) -> bytes:
-    """Return frames, each written as an identifier and data in hexadecimal digits."""
-    can_frames = []
-    for frame in frames:
-        identifier, data = frame.split(maxsplit=1)
-        can_frames.append(CanFrame(int(identifier, 16), bytes.fromhex(data)))
-    return pack_frames(can_frames)
+def test_set_and_its_reply_have_the_bytes_of_the_specification_on_a_serial_line() -> None:
+    """One frame each, encoded with COBS."""
+    wire = SerialWire(921_600, sequence=7)
+    request = "00 05 05 04 01 08 06 17 2A 02 01 03 03 A0 01 01 07 20 03 93 C9 91 CA 00"
+    reply = "00 05 85 04 01 08 04 02 01 05 01 01 05 34 FF 32 E7 00"
+
+    assert wire.request(1, "Set", PART) == bytes.fromhex(request)
+    assert wire.received(bytes.fromhex(reply)) == [Reply(REPLY)]
 
 
-SERIAL_EXCHANGE = (
-    bytes.fromhex("00 05 05 04 01 08 06 17 2A 02 01 03 03 A0 01 01 07 20 03 93 C9 91 CA 00"),
-    bytes.fromhex("00 05 85 04 01 08 04 02 01 05 01 01 05 34 FF 32 E7 00"),
-)
-CAN_EXCHANGE = (
-    can_bytes("201 0800 0506 172A 0201", "201 0801 0300 A001 0000", "201 0802 2003 0000 0000"),
-    can_bytes("181 0800 0503 0201 0500", "181 0801 0000 0000 0000"),
-)
+def test_set_and_its_reply_have_the_bytes_of_the_specification_on_can() -> None:
+    """Three frames, and two of the reply."""
+    wire = CanWire(500_000, sequence=7)
+    request = ("0800 0506 172A 0201", "0801 0300 A001 0000", "0802 2003 0000 0000")
+    reply = ("0800 0503 0201 0500", "0801 0000 0000 0000")
 
-
-@pytest.mark.parametrize(
-    ("wire", "exchange"),
-    [
-        pytest.param(SerialWire(921_600, sequence=7), SERIAL_EXCHANGE, id="serial"),
-        pytest.param(CanWire(500_000, sequence=7), CAN_EXCHANGE, id="can"),
-    ],
-)
-def test_set_and_its_reply_have_the_bytes_of_the_specification(
-    wire: Wire, exchange: tuple[bytes, bytes]
-) -> None:
-    """On a serial line and on CAN, one message each."""
-    request, reply = exchange
-
-    assert wire.request(1, "Set", PART) == request
-    assert wire.received(reply) == [Reply(REPLY)]
+    sent = [CanFrame(0x201, bytes.fromhex(data)) for data in request]
+    received = [CanFrame(0x181, bytes.fromhex(data)) for data in reply]
+    assert wire.request(1, "Set", PART) == pack_frames(sent)
+    assert wire.received(pack_frames(received)) == [Reply(REPLY)]
 
 
 def test_set_and_its_reply_have_the_bytes_of_the_specification_over_modbus_tcp() -> None:

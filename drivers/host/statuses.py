@@ -147,12 +147,12 @@ class StatusContradictions:
             raise contradicted(self._name, problem)
 
     def _may_wait(self, sent_at: float, now: float, clock: HeldClock) -> bool:
-        """Whether the last set may wait although it was committed: its clock is not synchronised.
+        """Whether the last set may wait although it was committed: its clock is not synchronized.
 
         sent_at: when the request for the status went out [s].
         """
-        is_synchronised = self._is_start_known and clock.error(now) < math.inf
-        return sent_at < self._may_wait_until and not is_synchronised
+        is_start_sure = self._is_start_known and clock.is_synchronized(now)
+        return sent_at < self._may_wait_until and not is_start_sure
 
     def _note_agreement(self, *, shows_watchdog: bool) -> None:
         """Note a status without contradiction, which ends the row.

@@ -43,14 +43,11 @@ test: .venv/installed-test
 test-changed: .venv/installed-test
 	$(BIN)/python tests/support/changed_tests.py $(if $(SINCE),--since $(SINCE))
 
-# All that is long, one target after another, each within an hour; the rest goes on after a failure.
-# Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
+# All that is long, one target after another, in at most three hours; the results are in
+# out/nightly/page.md. Others: make nightly NIGHTLY='soak kill-test', or NIGHTLY_OPTIONS=--report
 NIGHTLY := test-long test-kernels test-pymodbus test-busy faults mutants rename-test firmware-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
 nightly: .venv/installed-test
-	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
-		$(MAKE) $$target || failed="$$failed $$target"; \
-		echo "nightly: $$target took $$(($$(date +%s) - start)) s"; done; \
-	echo "nightly: failed:$${failed:- none}"; test -z "$$failed"
+	$(BIN)/python tests/programs/nightly.py $(NIGHTLY) $(NIGHTLY_OPTIONS)
 
 # Whole programmes of which `make test` has a short form: every command of the pages typed from an
 # empty folder, conformance of the examples, an identified plate; and those

@@ -1,0 +1,70 @@
+"""The long tests run to their end, whatever fails or hangs on their way."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = Path(__file__).parents[1] / "tests" / "programs" / "nightly.py"
+FIVE_SECONDS = str(5 / 3600)  # hours
+
+MAKEFILE = """\
+failing:
+\t@echo "channel 2 plays"; exit 3
+hanging:
+\t@sleep 1000 & echo $$! > left_behind; sleep 1000
+passing:
+\t@echo "=== 3 passed in 1 s ==="
+"""
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process exists and is no zombie."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
+    state = status.rpartition(")")[2].split()[0]
+    return state != "Z"
+
+
+def test_nightly_lists_every_target_after_a_failed_and_a_hung_one(tmp_path: Path) -> None:
+    """The page has a row for each target and the output of failed ones; no process is left."""
+    (tmp_path / "Makefile").write_text(MAKEFILE)
+
+    run = subprocess.run(
+        [
+            *(sys.executable, PROGRAM, "failing", "hanging", "passing"),
+            *("--folder", tmp_path, "--target-hours", FIVE_SECONDS),
+        ],
+        capture_output=True,
+        text=True,
+    )
+
+    page = (tmp_path / "out/nightly/page.md").read_text()
+    results = {}
+    for row in page.splitlines():
+        if row.startswith("| `"):
+            target, result, _minutes, last_line = row[2:-2].split(" | ")
+            results[target] = (result, last_line)
+    assert results["`failing`"] == ("failed", "channel 2 plays")
+    assert results["`hanging`"][0].startswith("ended after")
+    assert results["`passing`"] == ("passed", "3 passed in 1 s")
+    assert "## failing: failed\n\n    channel 2 plays\n" in page
+    assert not is_running(int((tmp_path / "left_behind").read_text()))
+    assert run.returncode == 1
+
+
+def test_nightly_reports_targets_for_which_no_time_is_left(tmp_path: Path) -> None:
+    """A run that is out of time ends with a failure, and says what it has not run."""
+    (tmp_path / "Makefile").write_text(MAKEFILE)
+
+    run = subprocess.run(
+        [sys.executable, PROGRAM, "passing", "--folder", tmp_path, "--hours", "0"],
+        capture_output=True,
+        text=True,
+    )
+
+    assert (
+        "| `passing` | not run: 0 hours were up |" in (tmp_path / "out/nightly/page.md").read_text()
+    )
+    assert run.returncode == 1

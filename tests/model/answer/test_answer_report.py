@@ -1,4 +1,4 @@
-"""Measures of answers on request, their exposure, and questions as JSON and on the command line."""
+"""Measures of answers, their exposure, and questions in JSON."""
 
 import errno
 import re
@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 
 from kit.plates import make_paper_rig, smooth_rig, smooth_table
-from kit.set_table import only, wants
-from kit.set_table import phased as answer
+from kit.set_table import only, phased, wants
 from model.answer.answer_report import (
     Timing,
-    cell_centers,
-    concentration_of,
     exposures,
     hand_weighting,
     measures,
@@ -24,7 +21,7 @@ from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement
 from model.arrays import lattice
 from model.commands.table_cli import query as query_command
-from model.finger import detection_threshold, fingertip_points, is_beyond
+from model.finger import detection_threshold, fingertip_points
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
@@ -42,75 +39,84 @@ PUBLISHED = {
 """Factors of ISO 5349-1:2001, table A.2, at the nominal frequencies of third octaves [Hz]."""
 
 
-def test_weighting_is_that_of_the_standard():
+def test_hand_weighting_is_that_of_the_standard():
     """Its table is of the exact frequencies, 10^(n/10)."""
     nominal = np.array([*PUBLISHED])
     exact = 10 ** (np.round(10 * np.log10(nominal)) / 10)
     assert hand_weighting(exact) == pytest.approx([*PUBLISHED.values()], rel=5e-3)
 
 
-def test_exposure_is_the_weighted_root_mean_square_of_all_that_a_finger_feels():
-    """By levels above threshold: of a content alone, of what leaks, and of two together.
+def test_exposure_is_the_weighted_rms_of_the_vibration_of_a_finger():
+    """By levels above threshold: of a content alone, and of what two leak to a quiet finger.
 
     A finger's own content counts at its loudest point, up to 6 dB above the mean of its level.
     """
     table = smooth_table()
-    found, louder = (
-        answer(
+    served, louder = (
+        phased(
             table,
-            [wants(at, level_db_sl=level) for at in ((0.09, 0.07), (0.25, 0.18))],
+            [wants((0.09, 0.07), level_db_sl=level), wants((0.25, 0.18), level_db_sl=level)],
             [Finger((0.16, 0.20))],
         )
         for level in (20.0, 26.0)
     )
-    hertz = np.array([layer.frequency for layer in found.layers])
+    hertz = np.array([layer.frequency for layer in served.layers])
     weighted = hand_weighting(hertz) * detection_threshold(hertz) / np.sqrt(2)
-    *own, quiet = exposures(table, found)
-    for exposure, each, alone in zip(own, found.fingers, weighted, strict=False):
-        mean = alone * 10 ** (each.promised_level_db_sl / 20)
-        assert mean < exposure < 2.5 * mean
-    heard = 10 ** (found.fingers[2].foreign_level_db_sl / 20)
-    assert min(weighted) * heard <= quiet <= max(weighted) * heard
-    assert exposures(table, louder) == pytest.approx(
-        [10 ** (6 / 20) * each for each in (*own, quiet)], rel=1e-3
-    )
+
+    *own, quiet = exposures(table, served)
+    louder_exposures = exposures(table, louder)
+
+    for number, exposure in enumerate(own):
+        level = served.fingers[number].promised_level_db_sl
+        mean = weighted[number] * 10 ** (level / 20)
+        assert mean < exposure < 2.5 * mean, number
+    crosstalk = 10 ** (served.fingers[2].foreign_level_db_sl / 20)
+    assert min(weighted) * crosstalk <= quiet <= max(weighted) * crosstalk
+    expected = 10 ** (6 / 20) * np.array([*own, quiet])
+    np.testing.assert_allclose(louder_exposures, expected, rtol=1e-3)
 
 
-TARGET = (0.15, 0.12)
 PLATE = smooth_rig().plate
 AREA = PLATE.length * PLATE.width
-POINTS = cell_centers(PLATE)
-
-
-def concentration(*amplitudes, frequencies=(100.0,)):
-    """Concentration of amplitudes (f, p) at the centers of cells, 1 m/s² at the target."""
-    field = np.array(amplitudes, dtype=float)
-    return concentration_of(
-        np.array(frequencies), field, ~is_beyond(POINTS, [TARGET]), felt=1.0, plate=PLATE
-    )
 
 
 def test_concentration_agrees_with_points_counted_one_by_one():
-    """Two targets, from points 1.7 mm apart; with quiet fingers there is no concentration."""
+    """Two targets, from points 1.7 mm apart."""
     table = smooth_table()
-    places = ((0.09, 0.08), (0.24, 0.14))
-    answer = query(table, Placement(places), drive_mode="phased")
-    layer = answer.layers[0]
-    points = lattice(*(np.arange(0.0008, side, 0.0017) for side in (PLATE.length, PLATE.width)))
-    frequencies, amplitudes = table.amplitudes(layer.excitation, points)
+    targets = ((0.09, 0.08), (0.24, 0.14))
+    answer = query(table, Placement(targets), drive_mode="phased")
+
+    concentration = measures(table, answer).concentration
+
+    excitation = answer.layers[0].excitation
+    columns = np.arange(0.0008, PLATE.length, 0.0017)
+    points = lattice(columns, np.arange(0.0008, PLATE.width, 0.0017))
+    frequencies, amplitudes = table.amplitudes(excitation, points)
     energy = ((amplitudes / frequencies[:, None]) ** 2).sum(axis=0)
     peak = amplitudes.sum(axis=0)
-    discs = [fingertip_points(*place, PLATE) for place in places]
-    felt = min(table.amplitudes(layer.excitation, disc)[1].sum(axis=0).mean() for disc in discs)
-    near = np.min([np.hypot(*(points - place).T) for place in places], axis=0) <= 0.05
-    far = np.sort(peak[~near])
-    found = measures(table, answer).concentration
+    means = []
+    for target in targets:
+        _, at_fingertip = table.amplitudes(excitation, fingertip_points(*target, PLATE))
+        means.append(at_fingertip.sum(axis=0).mean())
+    felt = min(means)
+    distances = [np.linalg.norm(points - target, axis=1) for target in targets]
+    is_near = np.min(distances, axis=0) <= 0.05
+    far = np.sort(peak[~is_near])
     contrast = 20 * np.log10(felt / far[int(0.95 * len(far))])
-    assert found.contrast_95_db == pytest.approx(contrast, abs=0.1)
-    assert found.area_above_half == pytest.approx((peak > felt / 2).mean() * AREA, rel=0.02)
-    assert found.energy_share_near == pytest.approx(energy[near].sum() / energy.sum(), abs=0.01)
-    answer = query(table, Placement(places[:1], places[1:]), drive_mode="phased")
-    assert measures(table, answer).concentration is None
+    assert concentration.contrast_95_db == pytest.approx(contrast, abs=0.1)
+    area = np.mean(peak > felt / 2) * AREA
+    assert concentration.area_above_half == pytest.approx(area, rel=0.02)
+    energy_share = energy[is_near].sum() / energy.sum()
+    assert concentration.energy_share_near == pytest.approx(energy_share, abs=0.01)
+
+
+def test_answer_with_quiet_fingers_has_no_concentration():
+    """Its contrast is that with the quiet fingers."""
+    placed = Placement(((0.09, 0.08),), ((0.24, 0.14),))
+
+    answer = query(smooth_table(), placed, drive_mode="phased")
+
+    assert measures(smooth_table(), answer).concentration is None
 
 
 PLACED = Placement(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)))
@@ -119,8 +125,8 @@ PLACED = Placement(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)))
 @pytest.fixture(scope="module")
 def rig():
     """A mesh that is quick to solve, and weightless fingers, as on the plate in time."""
-    known = replace(Uncertainty.none(), gain=0.05, phase_deg=5.0)
-    return replace(make_paper_rig(24, 18), fingertip=None, uncertainty=known)
+    tolerances = replace(Uncertainty.none(), gain=0.05, phase_deg=5.0)
+    return replace(make_paper_rig(24, 18), fingertip=None, uncertainty=tolerances)
 
 
 @pytest.fixture(scope="module")
@@ -135,31 +141,37 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table)
     Envelopes do better with the same excitation.
     """
     reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=300.0)
-    solved, timing = Transients(plate_in_time(reduced, rig.eras)), Timing(table)
+    plate = Transients(plate_in_time(reduced, rig.eras))
+    timing = Timing(table)
     plain, _ = only(table, PLACED, drive_mode="phased")
+
     shaped_layer = timing.with_envelopes(plain, PLACED)
+
     assert plain.onset is plain.ending is None
-    ramps = (
+    assert shaped_layer.excitation == plain.excitation
+    ramped = (
         ramped_onset(plain.excitation, rig.eras, ramp=0.040),
         ramped_ending(plain.excitation, rig.eras, ramp=0.040),
     )
-    envelopes = (shaped(shaped_layer.onset, rig.eras), shaped(shaped_layer.ending, rig.eras))
-    found = []
-    for layer, (onset, ending) in ((plain, ramps), (shaped_layer, envelopes)):
-        contrast = solved.contrast_db(onset, targets=PLACED.targets, quiet=PLACED.quiet)
-        left = solved.residual_db(layer.excitation, ending)
-        both = timing.transient_contrast_db(layer, PLACED), timing.residual_db(layer, PLACED)
-        found.append(both)
-        assert both[0] == pytest.approx(contrast, abs=0.1)
-        assert both[1] == pytest.approx(left, abs=0.2)
-    assert found[1][0] > found[0][0] + 3
-    assert found[1][1] < found[0][1] - 10
-    assert shaped_layer.excitation == plain.excitation
+    enveloped = (shaped(shaped_layer.onset, rig.eras), shaped(shaped_layer.ending, rig.eras))
+    contrasts = []
+    residuals = []
+    for layer, (onset, ending) in ((plain, ramped), (shaped_layer, enveloped)):
+        contrast = timing.transient_contrast_db(layer, PLACED)
+        residual = timing.residual_db(layer, PLACED)
+        in_time = plate.contrast_db(onset, targets=PLACED.targets, quiet=PLACED.quiet)
+        residual_in_time = plate.residual_db(layer.excitation, ending)
+        assert contrast == pytest.approx(in_time, abs=0.1)
+        assert residual == pytest.approx(residual_in_time, abs=0.2)
+        contrasts.append(contrast)
+        residuals.append(residual)
+    assert contrasts[1] > contrasts[0] + 3
+    assert residuals[1] < residuals[0] - 10
 
 
 BAD_LINES = {
     "nonsense": r'such as \{"target".*Invalid JSON',
-    "[]": r'such as \{"target".*object',
+    "[]": "object",
     '{"target": [0.1]}': "target",
     '{"target": [0.1, 0.1], "loud": 3}': "loud",
     '{"target": [0.1, "x"]}': "target.1",
@@ -172,25 +184,36 @@ GOOD_LINE = (
 )
 
 
-def test_a_line_of_a_batch_is_read_key_by_key_or_refused():
-    """Targets, quiet fingers, mode, level and loads; else the key that is wrong is named."""
-    *refused, found = query_batch(smooth_table(), [*BAD_LINES, GOOD_LINE])
-    for number, (row, named) in enumerate(zip(refused, BAD_LINES.values(), strict=True), start=1):
-        assert row["line"] == number
+def test_batch_reports_the_wrong_key_of_a_line():
+    """With the number of the line."""
+    *errors, _ = query_batch(smooth_table(), [*BAD_LINES, GOOD_LINE])
+
+    assert [row["line"] for row in errors] == [1, 2, 3, 4, 5, 6, 7]
+    for row, named in zip(errors, BAD_LINES.values(), strict=True):
         assert re.search(named, row["error"])
+
+
+def test_batch_reads_a_line_key_by_key():
+    """Targets, quiet fingers, mode, level and loads."""
+    (row,) = query_batch(smooth_table(), [GOOD_LINE])
+
     placed = Placement(((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),), (1.0, 2.0, 0.5))
-    layer, felt = only(smooth_table(), placed, 15.0, drive_mode="switched")
-    assert found["layers"][0]["drive"] == smooth_table().drive_of(layer.excitation)
-    assert found["layers"][0]["fingers"] == [0, 1]
-    assert found["fingers"][0]["promised_contrast_db"] == felt.promised_contrast_db
+    layer, sensation = only(smooth_table(), placed, 15.0, drive_mode="switched")
+    (row_layer,) = row["layers"]
+    assert row_layer["drive"] == smooth_table().drive_of(layer.excitation)
+    assert row_layer["fingers"] == [0, 1]
+    contrast = row["fingers"][0]["promised_contrast_db"]
+    assert contrast == sensation.promised_contrast_db
 
 
-def test_batch_is_not_blamed_where_its_reader_closes(tmp_path, monkeypatch):
-    """As in `era table query TABLE --batch FILE | head`: the error is of the answers' pipe."""
-    batch, file = tmp_path / "b.jsonl", tmp_path / "t.npz"
-    save_table(smooth_table(), file)
+def test_batch_reports_a_closed_pipe_and_no_broken_file(tmp_path, monkeypatch):
+    """As in `era table query TABLE --batch FILE | head`."""
+    batch = tmp_path / "b.jsonl"
     batch.write_text('{"target": [0.1, 0.1]}\n')
+    file = tmp_path / "t.npz"
+    save_table(smooth_table(), file)
     broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
     monkeypatch.setattr("builtins.print", broken)
+
     with pytest.raises(BrokenPipeError):
         query_command(file, batch=batch)

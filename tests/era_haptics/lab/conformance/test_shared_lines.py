@@ -1,5 +1,6 @@
 """Conformance on lines with other amplifiers, to which nothing is said that could change them."""
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -7,47 +8,51 @@ import pytest
 
 from cases import shortly
 from drivers.protocol.records import Values
-from drivers.wires.can_frames import unpack_frames
+from drivers.wires.can_frames import CanFrame, unpack_frames
 from kit.clock import JUDGED_LINE_KINDS, JudgedLine, judged, varied
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
 SKIPPED = {"steps_as_stated", "limited"}
-FOR_ALL = {
+REACHES_NEIGHBORS = {
     "serial": {"broadcasts", "discarded_frames"},
-    "rtu": {"broadcasts", "present_areas", "events"},
-    "tcp": {"events"},
+    "rtu": {"broadcasts", "present_areas"},
+    "tcp": set(),
     "can": {"broadcasts", "network_management"},
 }
-"""Checks by the kind of wire that leave out what would reach others, or have no Events."""
-NEXT, HIGHEST, PRE_OPERATIONAL = 2, {"can": 127}, 127
+"""Checks by the kind of wire that leave out requests that would reach others."""
+WITHOUT_EVENTS = ("rtu", "tcp")
+NEXT = 2
+HIGHEST = {"serial": 247, "rtu": 247, "tcp": 247, "can": 127}
+BOOT_UP, PRE_OPERATIONAL = b"\0", b"\x7f"
 GATEWAY_WAITS = 1.0  # s; for a unit that is not there
 
 
 class Neighbor(SimulatedAmplifier):
-    """An amplifier that notes what it is asked to do; identities and objects are read without."""
+    """An amplifier that records its requests; identities and objects are read without."""
 
     def __init__(self, name: str) -> None:
-        self.got: list[str] = []
+        self.requests: list[str] = []
         super().__init__(name, channels=2)
 
     def handle(self, name: str, values: Values, now: float) -> Values:
-        """Carry out a request, and note it."""
-        self.got.append(name)
+        """Carry out a request, and record it."""
+        self.requests.append(name)
         return super().handle(name, values, now)
 
     def restart(self, now: float) -> None:
-        """Begin anew, and note it."""
-        self.got.append("restart")
+        """Restart, and record it."""
+        self.requests.append("restart")
         super().restart(now)
 
 
-def neighbors_of(kind: str) -> dict[int, Neighbor]:
-    """Return amplifiers at the next and at the highest address."""
-    return {each: Neighbor(f"at {each}") for each in (NEXT, HIGHEST.get(kind, 247))}
+@pytest.fixture
+def neighbors(kind: str) -> dict[int, Neighbor]:
+    """Amplifiers at the next and at the highest address."""
+    return {address: Neighbor(f"at {address}") for address in (NEXT, HIGHEST[kind])}
 
 
-OTHER_ADDRESSES = [
+CHECKS_OF_ADDRESSES = [
     "damaged_frames",
     "doubled_frames",
     "broadcasts",
@@ -59,46 +64,61 @@ OTHER_ADDRESSES = [
     "limited",
     "discarded_frames",
 ]
-"""Checks that send what others hear, or listen to what all may say; and one that is skipped."""
+"""Checks that send messages that others hear, or listen to them; and one that is skipped."""
 
 
-@pytest.mark.parametrize("names", shortly([[], OTHER_ADDRESSES], [OTHER_ADDRESSES]))
+@pytest.mark.parametrize("names", shortly([[], CHECKS_OF_ADDRESSES], [CHECKS_OF_ADDRESSES]))
 @pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 def test_conforming_amplifier_passes_on_a_shared_line(
-    kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
+    kind: str,
+    names: list[str],
+    neighbors: dict[int, Neighbor],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its neighbors get nothing, and nodes on CAN stay out of operation, by their heartbeats."""
-    others, beats, send = neighbors_of(kind), set[bytes](), JudgedLine.send
+    sent: list[bytes] = []
+    send = JudgedLine.send
 
-    def heard(line: JudgedLine, data: bytes) -> None:
-        if kind == "can":
-            frames = unpack_frames(data)
-            beats.update(each.data for each in frames if each.id & 127 in others)
+    def record(line: JudgedLine, data: bytes) -> None:
+        sent.append(data)
         send(line, data)
 
-    monkeypatch.setattr(JudgedLine, "send", heard)
-    results = judged(kind, names, neighbors=others)
-    failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
-    assert not failed, failed
-    skipped = {each.check.name: each.reason for each in results if each.result == "skipped"}
-    assert skipped.keys() == ({"limited"} if names else SKIPPED) | FOR_ALL[kind]
-    where = ", ".join(map(str, sorted(others)))
-    assert all(where in skipped[name] for name in FOR_ALL[kind] - {"events"})
-    assert [each.got for each in others.values()] == [[], []]
-    assert {each.state for each in others.values()} == {"SWITCH_ON_DISABLED"}
-    assert {each for each in beats if len(each) == 1} <= {b"\0", bytes([PRE_OPERATIONAL])}
+    monkeypatch.setattr(JudgedLine, "send", record)
+
+    results = judged(kind, names, neighbors=neighbors)
+
+    failures = {result.check.name: result.reason for result in results if result.result == "failed"}
+    skipped = {result.check.name: result.reason for result in results if result.result == "skipped"}
+    assert failures == {}
+    expected = {"limited"} if names else SKIPPED
+    if kind in WITHOUT_EVENTS:
+        expected = {*expected, "events"}
+    assert set(skipped) == expected | REACHES_NEIGHBORS[kind]
+    addresses = ", ".join(map(str, sorted(neighbors)))
+    for name in REACHES_NEIGHBORS[kind]:
+        assert addresses in skipped[name]
+    for address, neighbor in neighbors.items():
+        assert neighbor.requests == [], address
+        assert neighbor.state == "SWITCH_ON_DISABLED", address
+    if kind == "can":
+        frames: list[CanFrame] = [frame for data in sent for frame in unpack_frames(data)]
+        heartbeats = {frame.data for frame in frames if frame.id & 127 in neighbors}
+        states = {data for data in heartbeats if len(data) == 1}
+        assert states <= {BOOT_UP, PRE_OPERATIONAL}
 
 
 class Gateway:
-    """Units behind a gateway: it asks one after the other, and replies for those that do not."""
+    """Units behind a gateway, which requests one after the other and replies for absent ones."""
 
     def __init__(
         self, units: Mapping[int, SimulatedAmplifier], send: Callable[[bytes], None]
     ) -> None:
-        self._units, self._send = units, send
-        self._end = ModbusAmplifiers(units, self._replied, is_rtu=False)
-        self._waiting: list[bytes] = []
+        self._units = units
+        self._send = send
+        self._end = ModbusAmplifiers(units, self._reply, is_rtu=False)
+        self._waiting = deque[bytes]()
         self._until = 0.0
+        self._has_reply = False
 
     def receive(self, data: bytes, now: float) -> None:
         """Take whole frames of the host at a time [s]."""
@@ -109,31 +129,35 @@ class Gateway:
         self.tick(now)
 
     def tick(self, now: float) -> None:
-        """Ask for what waits, unless a unit is still awaited."""
-        for each in self._units.values():
-            each.tick(now)
+        """Pass on the next frame, unless a unit has time to reply."""
+        for unit in self._units.values():
+            unit.tick(now)
         while self._waiting and now >= self._until:
             frame = self._waiting[0]
-            self._is_replied = False
+            self._has_reply = False
             self._end.receive(frame, now)
-            if not self._is_replied and not self._until:
+            if not self._has_reply and not self._until:
                 self._until = now + GATEWAY_WAITS
                 return
-            if not self._is_replied:
-                self._send(frame[:4] + b"\0\3" + bytes([frame[6], frame[7] | 0x80, 11]))
+            if not self._has_reply:
+                header = frame[:4] + b"\0\3"
+                self._send(header + bytes([frame[6], frame[7] | 0x80, 11]))
             self._until = 0.0
-            del self._waiting[0]
+            self._waiting.popleft()
 
-    def _replied(self, data: bytes) -> None:
-        self._is_replied = True
+    def _reply(self, data: bytes) -> None:
+        self._has_reply = True
         self._send(data)
 
 
-def test_units_behind_one_gateway() -> None:
-    """The gateway replies for absent units after a second, and lets what comes behind wait."""
-    others = neighbors_of("tcp")
-    units: dict[int, SimulatedAmplifier] = {1: varied(), **others}
+@pytest.mark.parametrize("kind", ["tcp"])
+def test_units_behind_one_gateway(kind: str, neighbors: dict[int, Neighbor]) -> None:
+    """The gateway replies for absent units after a second, and lets other requests wait."""
+    units: dict[int, SimulatedAmplifier] = {1: varied(), **neighbors}
     names = ["identity", "obeys_in_time", "damaged_frames", "addresses"]
-    results = judged("tcp", names, far=partial(Gateway, units))
-    assert [each.result for each in results] == ["passed"] * len(names), results
-    assert [each.got for each in others.values()] == [[], []]
+
+    results = judged(kind, names, far=partial(Gateway, units))
+
+    assert [result.result for result in results] == ["passed"] * len(names), results
+    for address, neighbor in neighbors.items():
+        assert neighbor.requests == [], address

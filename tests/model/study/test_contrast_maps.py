@@ -1,11 +1,13 @@
-"""Maps of contrast, the summary of a table, the cost of clock errors, and export."""
+"""Maps of contrast, the summary of a table, the cost of tolerances, and export."""
 
 import csv
 import json
 import math
+from collections import defaultdict
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,10 +27,11 @@ from kit.plates import (
 )
 from kit.set_table import only
 from model.answer.stimulus import Placement
+from model.arrays import Point
 from model.cli import app
 from model.errors import InputError
 from model.finger import Grid
-from model.rig.rig import Channel, Uncertainty
+from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import table_export
@@ -43,9 +46,52 @@ from model.study.weak_cells import (
     pair_questions,
     text_map,
 )
+from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 
+# Costs of tolerances
+
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
+
+
+def rig_on_amplifiers(names: str) -> Rig:
+    """Return the paper's rig after an identification, with an amplifier for each ERA."""
+    rig = replace(smooth_rig(), uncertainty=IDENTIFIED)
+    wiring = {}
+    for number, corner in enumerate(rig.eras):
+        wiring[corner.name] = Channel(names[number], number)
+    return replace(rig, wiring=wiring)
+
+
+def test_contrast_falls_with_the_clock_error() -> None:
+    """Of two amplifiers with two ERAs each; an amplifier with all of them loses nothing."""
+    rig = rig_on_amplifiers("abab")
+
+    costs = [clock_cost(rig, {"a": error, "b": error}) for error in (0.0, 2e-5, 2e-4, math.inf)]
+    single = clock_cost(rig_on_amplifiers("aaaa"), {"a": math.inf})
+
+    contrasts = [cost.kept_db for cost in costs]
+    exact = costs[0].exact_db
+    assert contrasts[0] == exact
+    assert contrasts == sorted(contrasts, reverse=True)
+    assert contrasts[1] > exact - 2
+    assert contrasts[3] < exact - 2
+    assert single == PromiseCost(exact, exact)
+
+
+def test_only_uncertain_keys_cost_contrast() -> None:
+    """Twice the tolerance costs more."""
+    costs = []
+    for stiffness in (0.0, 0.1, 0.2):
+        uncertainty = replace(Uncertainty.none(), stiffness=stiffness)
+        costs.append(tolerance_costs(replace(smooth_table(), uncertainty=uncertainty)))
+
+    exact, less, more = costs
+    assert exact == {}
+    assert list(less) == ["stiffness"]
+    assert 0 < less["stiffness"] < more["stiffness"]
+
+
 RIG = """
 plate: {length: 305 mm, width: 229 mm, thickness: 1.5 mm, material: aluminium}
 mesh: 6x5 Q4
@@ -61,74 +107,50 @@ limits: {frequency: [40 Hz, 250 Hz]}
 uncertainty: {gain: 0.5 %%, phase_deg: 0.5, thickness: 0.1 %%, stiffness: 0.5 %%, damping: 1.02}
 """
 USB_US = round(1e6 * math.hypot(CLOCK_ERRORS["ftdi-low-latency"], 5e-6 / math.sqrt(3)), 1)
-
-
-def test_contrast_falls_with_the_error_and_stays_with_one_amplifier() -> None:
-    """Two amplifiers of two ERAs each; one with all of them loses nothing whatever its clock."""
-    rig = replace(smooth_rig(), uncertainty=IDENTIFIED)
-    halves = {era.name: Channel("ab"[n % 2], n // 2) for n, era in enumerate(rig.eras)}
-    both = replace(rig, wiring=halves)
-    costs = [clock_cost(both, {"a": each, "b": each}) for each in (0.0, 2e-5, 2e-4, math.inf)]
-    kept = [each.kept_db for each in costs]
-    assert kept[0] == costs[0].exact_db
-    assert kept == sorted(kept, reverse=True)
-    assert kept[0] - kept[1] < 2 < kept[0] - kept[3]
-    one = replace(rig, wiring={era.name: Channel("a", n) for n, era in enumerate(rig.eras)})
-    assert clock_cost(one, {"a": math.inf}) == PromiseCost(costs[0].exact_db, costs[0].exact_db)
+"""Error over USB: that of the line, and 5 us / sqrt(3) of the amplifier."""
 
 
 @pytest.mark.parametrize(
-    ("more", "error_us", "warnings"), [("", USB_US, 1), (", clock_error: unknown", None, 2)]
+    ("keys", "error_us", "warning_count"), [("", USB_US, 1), (", clock_error: unknown", None, 2)]
 )
-def test_config_check_tells_what_clocks_cost(
-    tmp_path: Path, more: str, error_us: float | None, warnings: int
+def test_config_check_reports_the_cost_of_clock_errors(
+    tmp_path: Path, keys: str, error_us: float | None, warning_count: int
 ) -> None:
-    """Over USB: that of the line, and 5 us / sqrt(3) of the amplifier; and which plays alone."""
-    (tmp_path / "rig.yaml").write_text(RIG % more)
-    ran = CliRunner().invoke(
-        config_commands, ["config", "check", str(tmp_path / "rig.yaml"), "--json"]
-    )
-    found = json.loads(ran.output)
-    assert found["ok"]
-    clocks = found["clocks"]
+    """And warns of an amplifier whose ERAs play alone."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG % keys)
+
+    output = CliRunner().invoke(config_commands, ["config", "check", str(path), "--json"]).output
+
+    report = json.loads(output)
+    assert report["ok"]
+    clocks = report["clocks"]
     assert clocks["error_us"] == {"a": USB_US, "b": error_us}
     assert clocks["kept_contrast_db"] < clocks["exact_contrast_db"]
-    assert len([each for each in found["warnings"] if "vibrations" in each]) == warnings
+    warnings = [warning for warning in report["warnings"] if "vibrations" in warning]
+    assert len(warnings) == warning_count
 
 
-def test_tolerance_costs_name_the_uncertain_keys_and_grow_with_them() -> None:
-    """Only keys that are uncertain cost contrast, and twice the tolerance costs more."""
-    table = smooth_table()
-    costs = []
-    for stiffness in (0.1, 0.2):
-        uncertainty = replace(Uncertainty.none(), stiffness=stiffness)
-        costs.append(tolerance_costs(replace(table, uncertainty=uncertainty)))
-    assert [*costs[0]] == ["stiffness"]
-    assert 0 < costs[0]["stiffness"] < costs[1]["stiffness"]
-    assert tolerance_costs(replace(table, uncertainty=Uncertainty.none())) == {}
+# Export
 
 
 @pytest.fixture(scope="module")
-def table():
-    """A small one."""
+def table() -> LocalizationTable:
+    """A small table."""
     return small_table()
 
 
-@pytest.fixture
-def struct(table, tmp_path):
-    """Its .mat file as MATLAB would see it."""
-    export_mat(table, tmp_path / "t.mat")
-    return loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+def exported(table: LocalizationTable, folder: Path) -> Any:
+    """Return a table's .mat file as MATLAB would read it."""
+    path = folder / "t.mat"
+    export_mat(table, path)
+    return loadmat(path, squeeze_me=True, struct_as_record=False)["table"]
 
 
-def read_csv(path):
-    """Rows as dictionaries of text."""
-    with path.open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-def test_export_mat_holds_the_table_to_the_bit(table, struct):
+def test_export_mat_has_the_table_to_the_bit(table: LocalizationTable, tmp_path: Path) -> None:
     """Fields, modes and provenance, to the bit and in their shapes."""
+    struct = exported(table, tmp_path)
+
     fields = table.unit_fields(table.raster.points)
     np.testing.assert_array_equal(struct.acceleration_m_s2.transpose(1, 2, 0), fields)
     np.testing.assert_array_equal(struct.frequency_hz, FREQUENCIES)
@@ -139,203 +161,250 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
     assert struct.mode == "switched"
     assert struct.plate.length_m == 0.3048
     assert struct.plate.material.E_pa == 70e9
-    assert struct.plate.air_gap.size == 0
-    assert (struct.fingertip.phalanx_mass_kg, struct.uncertainty.thickness) == (0.005, 0.02)
-    assert [era.name for era in struct.eras] == ["SW", "SE", "NE", "NW"]
-    assert [era.stiffness_n_m for era in struct.eras] == [17000.0] * 4
+    assert struct.plate.air_gap.size == struct.masses.size == 0
+    assert struct.fingertip.phalanx_mass_kg == 0.005
+    assert struct.uncertainty.thickness == 0.02
+    assert [corner.name for corner in struct.eras] == ["SW", "SE", "NE", "NW"]
+    assert [corner.stiffness_n_m for corner in struct.eras] == [17000.0] * 4
     assert struct.eras[2].x_m == 0.3048
 
 
-ROWS = ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
-
-
-def of_layers(table):
-    """The plate of the table of two layers, over air."""
+def test_export_mat_has_layers_and_air(table: LocalizationTable, tmp_path: Path) -> None:
+    """With the rows of a layer by frequency."""
+    rows = ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
     metal = table.plate.material
-    layers = LaminateLayer(metal, 0.001), LaminateLayer(metal, 0.0005, by_frequency=ROWS)
-    return replace(table.plate, laminate=Laminate(layers), air_gap=AirGap(0.002, closed=True))
+    layers = (LaminateLayer(metal, 0.001), LaminateLayer(metal, 0.0005, by_frequency=rows))
+    gap = AirGap(0.002, closed=True)
+    plate = replace(table.plate, laminate=Laminate(layers), air_gap=gap)
+
+    struct = exported(replace(table, plate=plate), tmp_path).plate
+
+    first, second = struct.laminate.layers
+    assert first.thickness_m == 0.001
+    assert first.by_frequency.size == 0
+    assert second.thickness_m == 0.0005
+    assert second.material.rho_kg_m3 == 2700.0
+    np.testing.assert_array_equal(second.by_frequency, rows)
+    assert struct.air_gap.depth_m == 0.002
+    assert struct.air_gap.closed == 1
 
 
-@pytest.mark.parametrize(
-    ("changes", "read", "expected"),
-    [
-        (
-            lambda table: {"plate": of_layers(table)},
-            lambda found: [
-                (each.thickness_m, each.material.rho_kg_m3, np.ravel(each.by_frequency).tolist())
-                for each in found.plate.laminate.layers
-            ],
-            [(0.001, 2700.0, []), (0.0005, 2700.0, np.ravel(ROWS).tolist())],
-        ),
-        (
-            lambda table: {"plate": of_layers(table)},
-            lambda found: (found.plate.air_gap.depth_m, found.plate.air_gap.closed),
-            (0.002, 1),
-        ),
-        (
-            lambda table: {
-                "masses": (PointLoad(0.1, 0.15, mass=0.06),),
-                "attachment_shapes": np.vstack(
-                    [table.attachment_shapes, table.attachment_shapes[:1]]
-                ),
-            },
-            lambda found: (found.masses.mass_kg, found.masses.y_m),
-            (0.06, 0.15),
-        ),
-        (lambda _: {}, lambda found: found.masses.size, 0),
-    ],
-    ids=["layers", "air", "a mass", "no mass"],
-)
-def test_export_mat_holds_what_some_tables_have(table, tmp_path, changes, read, expected):
-    """A laminate with the rows of its layers, air, masses: of one a struct, of none nothing."""
-    export_mat(replace(table, **changes(table)), tmp_path / "t.mat")
-    found = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
-    assert read(found) == expected
+def test_export_mat_has_a_mass(table: LocalizationTable, tmp_path: Path) -> None:
+    """As a struct."""
+    shapes = np.vstack([table.attachment_shapes, table.attachment_shapes[:1]])
+    mass = PointLoad(0.1, 0.15, mass=0.06)
+
+    struct = exported(replace(table, masses=(mass,), attachment_shapes=shapes), tmp_path)
+
+    assert struct.masses.mass_kg == 0.06
+    assert struct.masses.y_m == 0.15
 
 
-def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):
+def test_export_mat_refuses_a_large_table(
+    table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before anything is written; the error names a remedy."""
     monkeypatch.setattr(table_export, "MAX_MAT_BYTES", 1000)
+
     with pytest.raises(InputError, match="numpy"):
         export_mat(table, tmp_path / "t.mat")
+
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("drive_mode", ["switched", "phased"])
-def test_export_csv_of_patterns_holds_answers_in_the_drive_mode_of_the_table(drive_mode, tmp_path):
-    """In each row the levels of the ERAs, asked anew, give the promised level and contrast.
+def csv_rows(table: LocalizationTable, folder: Path, content: str) -> list[dict[str, str]]:
+    """Return the rows of a table's .csv file."""
+    path = folder / "t.csv"
+    export_csv(table, path, content=content)
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
 
-    In mode `switched` ERAs play at one level, and at one frequency or two; in `phased` at one
+
+def place_of(row: dict[str, str], finger: str) -> Point:
+    """Return the position of a finger in a row."""
+    return float(row[f"{finger}_x_m"]), float(row[f"{finger}_y_m"])
+
+
+@pytest.mark.parametrize(("mode", "is_switched"), [("switched", True), ("phased", False)])
+def test_export_csv_has_answers_in_the_drive_mode_of_the_table(
+    mode: str, is_switched: bool, tmp_path: Path
+) -> None:
+    """Each row has the promise of a query.
+
+    Switched ERAs play at the same level, and at one or two frequencies; phased ERAs at the same
     frequency with levels and phases of their own.
     """
-    table = replace(small_table(drive_mode=drive_mode), grid=Grid(2, 2))
-    export_csv(table, tmp_path / "t.csv", content="patterns")
-    rows = read_csv(tmp_path / "t.csv")
-    assert len({(row["target_x_m"], row["target_y_m"]) for row in rows}) == 4
+    table = replace(small_table(drive_mode=mode), grid=Grid(2, 2))
+
+    rows = csv_rows(table, tmp_path, "patterns")
+
+    assert len({place_of(row, "target") for row in rows}) == 4
     assert len(rows) > 4 * 4
-    names = [era.name for era in table.eras]
     for row in rows[::9]:
-        levels = {float(row[f"{name}_level"]) for name in names if row[f"{name}_level"]}
-        driven = [name for name in names if row[f"{name}_hz"]]
-        frequencies = {row[f"{name}_hz"] for name in driven}
-        if drive_mode == "switched":
+        names = [corner.name for corner in table.eras if row[f"{corner.name}_hz"]]
+        levels = {float(row[f"{name}_level"]) for name in names}
+        frequencies = {row[f"{name}_hz"] for name in names}
+        if is_switched:
             assert max(levels) == pytest.approx(min(levels))
             assert len(frequencies) <= 2
         else:
-            assert (len(driven), len(frequencies)) == (4, 1)
-        target, quiet = (
-            (float(row[f"{finger}_x_m"]), float(row[f"{finger}_y_m"]))
-            for finger in ("target", "quiet")
-        )
-        _, felt = only(table, Placement((target,), (quiet,)))
-        assert float(row["promised_contrast_db"]) == felt.promised_contrast_db
+            assert len(names) == 4
+            assert len(frequencies) == 1
+        placed = Placement((place_of(row, "target"),), (place_of(row, "quiet"),))
+        _, sensation = only(table, placed)
+        assert float(row["promised_contrast_db"]) == sensation.promised_contrast_db
         assert float(row["promised_level_db_sl"]) >= 20 - 1e-3
+
+
+def test_export_csv_has_no_levels_out_of_reach(table: LocalizationTable, tmp_path: Path) -> None:
+    """For ERAs that hardly move."""
     weak = replace(with_strokes(table, 1e-6), grid=Grid(1, 2))
-    export_csv(weak, tmp_path / "weak.csv", content="patterns")
-    assert all(not row["SW_level"] for row in read_csv(tmp_path / "weak.csv"))
+
+    rows = csv_rows(weak, tmp_path, "patterns")
+
+    assert {row["SW_level"] for row in rows} == {""}
 
 
-def test_export_csv_of_fields(table, tmp_path):
+def test_export_csv_has_fields(table: LocalizationTable, tmp_path: Path) -> None:
     """A row for each raster point and frequency, both parts of each ERA's field, to the bit."""
-    export_csv(table, tmp_path / "t.csv", content="fields")
-    rows = read_csv(tmp_path / "t.csv")
+    rows = csv_rows(table, tmp_path, "fields")
+
     assert len(rows) == table.raster.point_count * 3
     row = rows[3 * 7 + 2]
-    assert float(row["x_m"]) == table.raster.points[7, 0]
-    assert float(row["y_m"]) == table.raster.points[7, 1]
+    assert (float(row["x_m"]), float(row["y_m"])) == tuple(table.raster.points[7])
     assert row["frequency_hz"] == "250.0"
-    found = np.complex64(complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"])))
-    assert found == table.unit_fields(table.raster.points)[2, 2, 7]
+    field = complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"]))
+    assert np.complex64(field) == table.unit_fields(table.raster.points)[2, 2, 7]
 
+
+# Contrast maps
 
 QUIET = (0.2286, 0.0381)  # m; center of the fourth cell of the lowest row
 MODES = ("switched", "phased")
 
 
-def test_map_has_the_answer_of_every_place(tmp_path: Path) -> None:
-    """Promised and nominal contrast of a query there; none where the quiet finger itself is.
+@pytest.fixture(scope="module")
+def phased_table() -> LocalizationTable:
+    """A table of cells of 61 x 76 mm."""
+    rig = make_paper_rig(12, 9)
+    return build_table(rig, frequencies=FREQUENCIES, grid=era.Grid(5, 3), drive_mode="phased")
 
-    Of both drive modes side by side, in cells of 61 x 76 mm. As a frame, as pandas has it, places
-    along x come first, with a column for each mode and number. The command prints it as JSON, with
-    null for no answer.
-    """
-    table = build_table(
-        make_paper_rig(12, 9), frequencies=FREQUENCIES, grid=era.Grid(5, 3), drive_mode="phased"
-    )
-    found = era.contrast_map(table, QUIET, drive_modes=MODES)
-    for (row, y), (column, x) in product(enumerate(found.y), enumerate(found.x)):
-        far = math.dist((x, y), QUIET) >= 0.013
-        for mode in MODES:
-            promised = found.promised_db[mode][row, column]
-            assert np.isfinite(promised) == far
-            if far:
-                felt = era.query(table, (x, y), quiet=[QUIET], drive_mode=mode).fingers[0]
-                assert promised == pytest.approx(felt.promised_contrast_db, abs=1e-3)
-                nominal = found.nominal_db[mode][row, column]
-                assert nominal == pytest.approx(felt.contrast_db, abs=1e-3)
 
-    frame = found.to_frame()
+@pytest.fixture(scope="module")
+def contrasts(phased_table: LocalizationTable) -> era.ContrastMap:
+    """Its map for a quiet finger in both drive modes."""
+    return era.contrast_map(phased_table, QUIET, drive_modes=MODES)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_map_has_the_answer_of_every_place(
+    phased_table: LocalizationTable, contrasts: era.ContrastMap, mode: str
+) -> None:
+    """Promised and nominal contrast of a query there; none at the quiet finger itself."""
+    for row, column in product(range(3), range(5)):
+        place = (contrasts.x[column], contrasts.y[row])
+        promised = contrasts.promised_db[mode][row, column]
+        if math.dist(place, QUIET) < 0.013:
+            assert math.isnan(promised)
+            continue
+        answer = era.query(phased_table, place, quiet=[QUIET], drive_mode=mode)
+        sensation = answer.fingers[0]
+        assert promised == pytest.approx(sensation.promised_contrast_db, abs=1e-3), place
+        nominal = contrasts.nominal_db[mode][row, column]
+        assert nominal == pytest.approx(sensation.contrast_db, abs=1e-3), place
+
+
+def test_map_is_a_frame(contrasts: era.ContrastMap) -> None:
+    """Places along x come first, with a column for each mode and figure."""
+    frame = contrasts.to_frame()
+
     assert frame.shape == (15, 6)
+    promised = contrasts.promised_db["phased"]
     best = frame.loc[frame["phased_promised_db"].idxmax()]
-    row, column = np.unravel_index(np.nanargmax(found.promised_db["phased"]), (3, 5))
-    assert (best["x_m"], best["y_m"]) == (found.x[column], found.y[row])
-
-    era.save_table(table, tmp_path / "t.npz")
-    words = ["map", str(tmp_path / "t.npz"), "--quiet", "{},{}".format(*QUIET), "--json"]
-    result = CliRunner().invoke(app, ["table", *words, "--modes", ",".join(MODES)])
-    for mode, rows in json.loads(result.stdout)["promised_contrast_db"].items():
-        expected = pytest.approx(found.promised_db[mode], abs=0.1, nan_ok=True)
-        assert np.array(rows, dtype=float) == expected
+    row, column = np.unravel_index(np.nanargmax(promised), promised.shape)
+    assert best["x_m"] == contrasts.x[column]
+    assert best["y_m"] == contrasts.y[row]
 
 
-def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
-    """Half of a cell's contrasts are below its median, a tenth below the other.
+def test_command_prints_the_map(
+    phased_table: LocalizationTable, contrasts: era.ContrastMap, tmp_path: Path
+) -> None:
+    """As JSON, with null for no answer."""
+    path = tmp_path / "t.npz"
+    era.save_table(phased_table, path)
+    quiet = f"{QUIET[0]},{QUIET[1]}"
+    arguments = ["table", "map", str(path), "--quiet", quiet, "--modes", ",".join(MODES)]
 
-    Its other fingers are in different ones of 4 by 4 fields, at least 5 cm from the cell.
-    """
+    output = CliRunner().invoke(app, [*arguments, "--json"]).stdout
+
+    for mode, rows in json.loads(output)["promised_contrast_db"].items():
+        printed = np.array(rows, dtype=float)
+        np.testing.assert_allclose(printed, contrasts.promised_db[mode], rtol=0, atol=0.1)
+
+
+# Weak cells
+
+
+def test_weak_cells_have_percentiles_over_random_contrasts(table: LocalizationTable) -> None:
+    """Half of a cell's contrasts are below its median, a tenth below the tenth percentile."""
     rng = np.random.default_rng(0)
-    drawn: dict[tuple[float, float], list[float]] = {}
-    tried: dict[tuple[float, float], list[tuple[float, float]]] = {}
+    contrasts_of_cell = defaultdict(list)
+    answers = []
+    for questions in pair_questions(table):
+        pairs = []
+        for question in questions:
+            contrast = float(rng.uniform(0, 30))
+            contrasts_of_cell[question.targets[0]].append(contrast)
+            pairs.append((contrast, 0.0))
+        answers.append(pairs)
 
-    def at_random(question):
-        (target,), (other,) = question.targets, question.quiet
-        assert math.dist(target, other) >= 0.05
-        tried.setdefault(target, []).append(other)
-        drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
-        return drawn[target][-1], 0.0
+    weak = find_weak_cells(table, answers)
 
-    weak = find_weak_cells(table, [[*map(at_random, each)] for each in pair_questions(table)])
-    assert len(drawn) == len(weak.centers) == 12
-    for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
-        for value, contrasts in zip(values, drawn.values(), strict=True):
-            below = (np.array(contrasts) < value).mean()
-            assert below == pytest.approx(share, abs=1.5 / len(contrasts))
-    size = (table.plate.length, table.plate.width)
-    for target, others in tried.items():
-        counts, *_ = np.histogram2d(
-            *np.array(others).T, bins=(4, 4), range=[(0, side) for side in size]
-        )
-        assert counts.max() == 1
-        assert counts.sum() >= 16 - 4  # a place within 5 cm is in the target's field or beside it
-        (x, y) = target
-        mirrored = np.array(tried[min(tried, key=lambda at: math.dist(at, (size[0] - x, y)))])
-        np.testing.assert_allclose(
-            sorted(size[0] - mirrored[:, 0]), sorted(x for x, _ in others), atol=1e-12
-        )
+    assert len(contrasts_of_cell) == len(weak.centers) == 12
+    for number, contrasts in enumerate(contrasts_of_cell.values()):
+        values = np.array(contrasts)
+        tolerance = 1.5 / len(values)
+        assert np.mean(values < weak.median_db[number]) == pytest.approx(0.5, abs=tolerance)
+        assert np.mean(values < weak.tenth_db[number]) == pytest.approx(0.1, abs=tolerance)
 
 
-def test_wrong_questions_are_errors_and_not_silent_cells(table):
-    """A mistyped drive mode, and a finger off the plate."""
-    for target, mode in (((0.1, 0.1), "swiched"), ((0.9, 0.1), None)):
-        with pytest.raises(InputError):
-            contrasts_of(table, Placement((target,), ((0.2, 0.2),)), drive_mode=mode)
+def test_quiet_fingers_of_a_cell_are_all_over_the_plate(table: LocalizationTable) -> None:
+    """In different ones of 4 by 4 fields, at least 5 cm away; mirrored cells have mirrored ones.
 
-
-def test_weak_and_feasible_follow_from_twelve_decibels(table):
-    """Feasible by the median other finger, weak by one in ten; a text map shows both.
-
-    A cell of the map is no smaller than an eighth by a sixth of the plate.
+    A place within 5 cm is in the target's field or a neighboring one.
     """
+    length, width = table.plate.length, table.plate.width
+    quiet_places = defaultdict(list)
+    for questions in pair_questions(table):
+        for question in questions:
+            quiet_places[question.targets[0]].append(question.quiet[0])
+
+    for target, places in quiet_places.items():
+        points = np.array(places)
+        assert np.linalg.norm(points - target, axis=1).min() >= 0.05
+        counts, *_ = np.histogram2d(*points.T, bins=(4, 4), range=[(0, length), (0, width)])
+        assert counts.max() == 1
+        assert counts.sum() >= 16 - 4
+        opposite = (length - target[0], target[1])
+        distances = {math.dist(cell, opposite): cell for cell in quiet_places}
+        mirrored = np.array(quiet_places[distances[min(distances)]])
+        columns = np.sort(length - mirrored[:, 0])
+        np.testing.assert_allclose(columns, np.sort(points[:, 0]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("target", "mode"), [((0.1, 0.1), "swiched"), ((0.9, 0.1), None)], ids=["mode", "place"]
+)
+def test_wrong_questions_are_errors(
+    table: LocalizationTable, target: Point, mode: str | None
+) -> None:
+    """A mistyped drive mode and a finger off the plate are not cells without an answer."""
+    with pytest.raises(InputError):
+        contrasts_of(table, Placement((target,), ((0.2, 0.2),)), drive_mode=mode)
+
+
+def test_weak_and_feasible_follow_from_12_db() -> None:
+    """Feasible by the median of other fingers, weak by a tenth; a text map shows both."""
     weak = WeakCells(
         Grid(2, 2),
         np.zeros((4, 2)),
@@ -344,23 +413,35 @@ def test_weak_and_feasible_follow_from_twelve_decibels(table):
         errors_db=np.zeros((2, 4)),
         pairs_db=np.empty((2, 0)),
     )
+
     assert weak.feasible.tolist() == [True, True, False, False]
     assert weak.weak.tolist() == [False, True, True, True]
     assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
-    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(8, 5)
-    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 6)
 
 
-def test_summary_of_a_plate_too_small_for_two_fingers():
-    """Where no two fingers fit 5 cm apart the distribution is empty, not an endless loop."""
+@pytest.mark.parametrize(
+    ("grid", "expected"), [(Grid(24, 5), Grid(8, 5)), (Grid(4, 20), Grid(4, 6))], ids=["x", "y"]
+)
+def test_map_has_at_most_8_by_6_cells(table: LocalizationTable, grid: Grid, expected: Grid) -> None:
+    """Fewer if the table has."""
+    assert map_grid(replace(table, grid=grid)) == expected
+
+
+def test_summary_of_a_plate_too_small_for_two_fingers() -> None:
+    """If no two fingers fit 5 cm apart the distribution is empty, not an endless loop."""
     rig = make_paper_rig(6, 6)
+    eras = []
+    for corner in rig.eras:
+        eras.append(replace(corner, x=0.03 * (corner.x > 0), y=0.03 * (corner.y > 0)))
     small = replace(
         rig,
         plate=replace(rig.plate, length=0.03, width=0.03),
         mesh=replace(rig.mesh, length=0.03, width=0.03),
-        eras=tuple(replace(era, x=0.03 * (era.x > 0), y=0.03 * (era.y > 0)) for era in rig.eras),
+        eras=tuple(eras),
     )
-    built = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
-    summary = summarize(built, find_overview(built))
+    table = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
+
+    summary = summarize(table, find_overview(table))
+
     assert summary["promised_contrast_1_quiet_median_db"] is None
     assert summary["feasible_share"] is None

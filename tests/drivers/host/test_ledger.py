@@ -1,673 +1,509 @@
-"""The ledger and the line below it.
+"""Sets that the ledger admits stay within the limits whenever an amplifier plays them."""
 
-What the ledger admits stays within the limits whenever it is played; the line decides which request
-goes when and how often, and what callers learn.
-"""
-
-import asyncio
 import math
 import random
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import starmap
-from types import EllipsisType
+from dataclasses import replace
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from drivers.errors import CommandError, CommandRefused, LinkTimeout
+from drivers.errors import CommandError, CommandRefused
 from drivers.host.ledger import Ledger
-from drivers.host.requests import Job, Priority
 from drivers.host.set_admission import SetAdmission, StagedSet
 from drivers.playing import AmplifierLayer, AmplifierTone, Playback
-from drivers.protocol.sets import Envelope
-from drivers.wires.can_frames import CanFrame, pack_frames
-from drivers.wires.serial_frames import Frame, encode_frame
-from kit.clock import MemoryLine, in_virtual_time, unaltered
+from drivers.protocol.sets import Envelope, LayerSet
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 
 WIDE = GuardLimits(20.0, 1000.0, 1.0)
-CAN = capabilities(3)
+"""Limits that bound frequencies and the full level only."""
+CAPABILITIES = capabilities(3)
 
 
 def tone(
-    channel: int = 0, level: float = 0.5, frequency: float = 100.0, **other: object
+    level: float = 0.5, frequency: float = 100.0, channel: int = 0, **options: Any
 ) -> AmplifierTone:
-    """A tone of 100 Hz at half level unless told otherwise."""
-    return AmplifierTone(channel, frequency, level, **other)  # type: ignore[arg-type]
+    """Return a tone; options: of `AmplifierTone`."""
+    return AmplifierTone(channel, frequency, level, **options)
 
 
-def play(ledger: Ledger, token: int, at: float, *layers: AmplifierLayer) -> None:
-    """Admit, send and confirm a set without delay."""
-    ledger.sent(token, ledger.admit(layers, at), at)
-    ledger.resolve(token, at)
+def layer(number: int, *tones: AmplifierTone, **options: Any) -> AmplifierLayer:
+    """Return a layer; options: of `AmplifierLayer`."""
+    return AmplifierLayer(number, tones, **options)
 
 
-def refusal(ledger: Ledger, *layers: AmplifierLayer, at: float = 1.0) -> CommandRefused:
-    """The error with which layers are refused."""
-    with pytest.raises(CommandRefused) as raised:
-        ledger.admit(layers, at)
-    return raised.value
+class Account:
+    """A ledger, and the sets that are played on its amplifier."""
+
+    def __init__(self, capabilities: dict[str, Any] = CAPABILITIES, **limits: float) -> None:
+        self.ledger = Ledger(replace(WIDE, **limits), capabilities)
+        self.token = 0
+
+    def admit(self, time: float, *layers: AmplifierLayer) -> LayerSet:
+        """Return the first layer of a set as the ledger admits it at a time [s]."""
+        return self.ledger.admit(layers, time)[0]
+
+    def play(self, time: float, *layers: AmplifierLayer, delay: float = 0.0) -> LayerSet:
+        """Admit a set, send it, and confirm that it plays after a delay [s]."""
+        admitted = self.ledger.admit(layers, time)
+        self.token += 1
+        self.ledger.sent(self.token, admitted, time)
+        self.ledger.resolve(self.token, time + delay)
+        return admitted[0]
+
+    def refuse(self, time: float, *layers: AmplifierLayer) -> CommandRefused:
+        """Return the error with which a set is refused at a time [s]."""
+        with pytest.raises(CommandRefused) as refusal:
+            self.ledger.admit(layers, time)
+        return refusal.value
 
 
-BAD = {
-    "frequency": tone(1, frequency=1001.0),
-    "frequency below": tone(1, frequency=19.9),
-    "frequency nan": tone(1, frequency=math.nan),
-    "level": tone(1, level=1.0001),
-    "level nan": tone(1, level=math.nan),
-    "level negative": tone(1, level=-0.1),
-    "phase": replace(tone(1), phase=math.inf),
-    "channel": tone(3),
-    "knot": tone(1, onset=Envelope(100, ((10001, 9000),))),
-    "step": tone(1, ending=Envelope(1, ((1000, 0),))),
-    "phase of a knot": tone(1, ending=Envelope(100, ((1000, 0), (1000, 18001)))),
-    "number of a knot": tone(1, onset=Envelope(100, ((1000.5, 0),))),  # type: ignore[arg-type]
-    "knots": tone(1, onset=Envelope(100, ((1000, 0),) * 33)),
+INVALID_TONES = {
+    "frequency": tone(frequency=1001.0, channel=1),
+    "frequency below": tone(frequency=19.9, channel=1),
+    "frequency nan": tone(frequency=math.nan, channel=1),
+    "level": tone(1.0001, channel=1),
+    "level nan": tone(math.nan, channel=1),
+    "level negative": tone(-0.1, channel=1),
+    "phase": tone(phase=math.inf, channel=1),
+    "channel": tone(channel=3),
+    "knot": tone(channel=1, onset=Envelope(100, ((10001, 9000),))),
+    "step": tone(channel=1, ending=Envelope(1, ((1000, 0),))),
+    "phase of a knot": tone(channel=1, ending=Envelope(100, ((1000, 0), (1000, 18001)))),
+    "number of a knot": tone(channel=1, onset=Envelope(100, ((1000.5, 0),))),  # type: ignore[arg-type]
+    "knots": tone(channel=1, onset=Envelope(100, ((1000, 0),) * 33)),
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_tone_that_must_not_be_played_is_refused_with_its_channel(case: str) -> None:
-    """Beside a good one, in the second layer."""
-    bad = BAD[case]
-    assert (
-        refusal(Ledger(WIDE, CAN), AmplifierLayer(0, (tone(),)), AmplifierLayer(1, (bad,))).channel
-        == bad.channel
-    )
+@pytest.mark.parametrize("case", INVALID_TONES)
+def test_invalid_tone_is_refused_with_its_channel(case: str) -> None:
+    """It is in the second layer; the first one is valid."""
+    invalid_tone = INVALID_TONES[case]
+
+    refusal = Account().refuse(1.0, layer(0, tone()), layer(1, invalid_tone))
+
+    assert refusal.channel == invalid_tone.channel
 
 
 @pytest.mark.parametrize(
-    "layer",
+    "invalid_layer",
     [
-        *(
-            AmplifierLayer(8, (tone(),)),
-            AmplifierLayer(-1, (tone(),)),
-            AmplifierLayer(0, (tone(),), ramp=1.001),
-        ),
-        *(
-            AmplifierLayer(0, (tone(),), ramp=math.nan),
-            AmplifierLayer(0, (tone(),), valid_for=60.1),
-        ),
-        *(
-            AmplifierLayer(0, (tone(),), renew=True),
-            AmplifierLayer(0, (), after=True),
-            AmplifierLayer(0, (tone(), tone())),
-        ),
+        layer(8, tone()),
+        layer(-1, tone()),
+        layer(0, tone(), ramp=1.001),
+        layer(0, tone(), ramp=math.nan),
+        layer(0, tone(), valid_for=60.1),
+        layer(0, tone(), renew=True),
+        layer(0, after=True),
+        layer(0, tone(), tone()),
     ],
 )
-def test_layer_that_cannot_be_is_refused(layer: AmplifierLayer) -> None:
-    """Numbers, times and flags of a layer, and a channel twice."""
-    refusal(Ledger(WIDE, CAN), layer)
+def test_invalid_layer_is_refused(invalid_layer: AmplifierLayer) -> None:
+    """Numbers, times and flags of a layer, and a channel that occurs twice."""
+    Account().refuse(1.0, invalid_layer)
 
 
 def test_set_of_more_than_127_parts_is_refused() -> None:
     """127 parts of 117 words carry 14 859 words, fewer than an amplifier may accept."""
     shape = Envelope(100, ((100, 0),) * 32)
-    tones = tuple(tone(channel, 0.01, onset=shape, ending=shape) for channel in range(16))
-    layers = [AmplifierLayer(number, tones) for number in range(16)]
-    can = {**capabilities(16), "layers": 16, "voices": 255, "set_words": 65535}
+    tones = [tone(0.01, channel=channel, onset=shape, ending=shape) for channel in range(16)]
+    layers = [layer(number, *tones) for number in range(16)]
+    large = {**capabilities(16), "layers": 16, "voices": 255, "set_words": 65535}
     admission = SetAdmission("a", Mock(is_complete=True))
-    refused = admission.refusal_of(StagedSet(layers), Ledger(WIDE, can), 0.0, set_time=0.0)
-    assert "a set must have at most 14859 words, got" in str(refused)
+
+    refusal = admission.refusal_of(StagedSet(layers), Ledger(WIDE, large), 0.0, set_time=0.0)
+
+    assert "14859 words" in str(refusal)
 
 
 def test_values_are_rounded_to_the_safe_side() -> None:
-    """Ramps upward, levels to the nearest, valid_for never to 0, which means without end.
+    """Ramps upward, levels and frequencies to the nearest, and valid_for never to 0 (endless).
 
-    Full level in single precision, which may be 1 + 2^-22, is full level.
+    A full level in single precision may be 1 + 2^-22.
     """
-    layer = AmplifierLayer(0, (tone(level=0.33336, frequency=99.99),), ramp=0.0101, valid_for=1e-5)
-    (one,) = Ledger(WIDE, CAN).admit([layer], 0.0)
-    assert (one.ramp, one.valid_for) == (11, 1)
-    assert (one.commands[0].level, one.commands[0].frequency) == (3334, 2000)
-    (full,) = Ledger(WIDE, CAN).admit([AmplifierLayer(0, (tone(level=1 + 2**-22),))], 0.0)
+    account = Account()
+    admitted = account.admit(0.0, layer(0, tone(0.33336, 99.99), ramp=0.0101, valid_for=1e-5))
+    full = account.admit(0.0, layer(0, tone(1 + 2**-22)))
+
+    assert admitted.ramp == 11
+    assert admitted.valid_for == 1
+    assert admitted.commands[0].level == 3334
+    assert admitted.commands[0].frequency == 2000
     assert full.commands[0].level == 10000
 
 
-def test_least_limit_holds() -> None:
-    """Of the rig (0.8), the amplifier (0.9) and a channel (0.7, for each)."""
-    can = {**capabilities(2), "level_max": 9000}
-    can["limits"][1]["level_max"] = 7000
-    ledger = Ledger(replace(WIDE, level=0.8), can)
-    assert refusal(ledger, AmplifierLayer(0, (tone(0, level=0.71),))).channel == 0
-    assert ledger.admit([AmplifierLayer(0, (tone(0, level=0.7),))], 1.0)
+def test_lowest_level_limit_applies() -> None:
+    """The rig allows 0.8, the amplifier 0.9 and the channel 0.7."""
+    limited = {**capabilities(2), "level_max": 9000}
+    limited["limits"][0]["level_max"] = 7000  # all channels share this record
+    account = Account(limited, level=0.8)
+
+    assert account.refuse(1.0, layer(0, tone(0.71))).channel == 0
+    account.admit(1.0, layer(0, tone(0.7)))
 
 
+@pytest.mark.parametrize("value", [0.0, math.nan])
 @pytest.mark.parametrize("name", ["slew", "power", "on_time", "duty", "rate"])
-def test_limits_that_leave_nothing_are_refused(name: str) -> None:
-    """Zero and NaN of each."""
-    for value in (0.0, math.nan):
-        with pytest.raises(CommandError):
-            Ledger(replace(WIDE, **{name: value}), CAN)
+def test_limit_that_allows_nothing_is_rejected(name: str, value: float) -> None:
+    """A limit of zero or NaN is an error of the caller."""
+    with pytest.raises(CommandError):
+        Account(**{name: value})
 
 
-@dataclass(frozen=True)
-class Asked:
-    """A layer that is asked for at a time [s], and what becomes of it.
+def test_levels_of_layers_add_up_until_a_layer_has_faded() -> None:
+    """0.6 leaves 0.4 for another layer; it fades for 20 ms from 1.0 s on, and then leaves 0.9."""
+    account = Account()
+    loud = layer(1, tone(0.9, 200.0))
+    account.play(0.0, layer(0, tone(0.6)))
+    assert account.refuse(1.0, layer(1, tone(0.41, 200.0))).channel == 0
+    account.admit(1.0, layer(1, tone(0.4, 200.0)))
+    assert account.refuse(1.0, loud).until is None
 
-    It is admitted unless it is refused; then until is when it would be allowed, None for never and
-    ... for anything. valid_for, longest [ms]: bounds of its time and of its ramp as admitted.
-    plays: whether it is sent and confirmed, too.
+    account.play(1.0, layer(0))
+
+    assert account.refuse(1.01, loud).until == pytest.approx(1.02)
+    account.admit(1.02 + 1e-9, loud)
+
+
+def test_waiting_set_counts_with_its_ending() -> None:
+    """Level 0.1 with an ending through 0.8 waits: another 0.3 is refused, 0.15 is not."""
+    account = Account()
+    onset = Envelope(500, ((500, 0),))
+    ending = Envelope(100, ((8000, 0),))
+    account.play(0.0, layer(0, tone(0.05, onset=onset)))
+    account.play(0.01, layer(0, tone(0.1, ending=ending), after=True))
+
+    account.refuse(0.02, layer(1, tone(0.3, 200.0)))
+    account.admit(0.02, layer(1, tone(0.15, 200.0)))
+
+
+def test_waiting_tone_continues_one_voice_only_with_its_phase_and_frequency() -> None:
+    """0.9 follows 0.9 as one voice, which leaves 0.1; as two voices it is refused."""
+    account = Account()
+    onset = Envelope(1000, ((9000, 0),))
+    continued = tone(0.9, keep_phase=True, onset=onset)
+    account.play(0.0, layer(0, continued))
+    account.refuse(0.05, layer(0, replace(continued, keep_phase=False), after=True))
+    account.refuse(0.05, layer(0, replace(continued, frequency=200.0), after=True))
+
+    account.play(0.05, layer(0, continued, after=True))
+
+    account.refuse(0.06, layer(1, tone(0.11, 200.0)))
+    account.admit(0.06, layer(1, tone(0.1, 200.0)))
+
+
+def test_cross_fade_at_full_level_is_admitted() -> None:
+    """The gains of a raised cosine add up to one, and their squares to less than one."""
+    account = Account(power=1.0)
+    account.play(0.0, layer(0, tone(1.0)))
+
+    account.admit(1.0, layer(0, tone(1.0, 200.0)))
+    account.admit(1.0, layer(0, tone(1.0, 200.0, channel=1)))
+
+
+def test_ending_during_a_cross_fade_is_refused() -> None:
+    """An ending at full level starts 1 ms after the commit: with the old tone, nearly 2."""
+    account = Account()
+    account.play(0.0, layer(0, tone(1.0)))
+    ending = Envelope(100, ((10000, 0),) * 10)
+
+    account.refuse(1.0, layer(0, tone(1.0, 200.0, ending=ending), ramp=1.0, valid_for=0.001))
+    account.admit(1.0, layer(0, tone(1.0, 200.0), ramp=1.0, valid_for=0.001))
+
+
+LATE_PULSE = tone(0.0, onset=Envelope(200, ((0, 0),) * 5 + ((9000, 0),)))
+"""Silent for 100 ms, at 0.9 after 120 ms and silent again after 140 ms."""
+
+
+def test_pulse_that_outlives_its_replacement_counts() -> None:
+    """A set that may arrive after 80 ms lets the pulse finish within the set's ramp of 60 ms."""
+    account = Account()
+    account.play(0.0, layer(0, LATE_PULSE))
+
+    def sudden(level: float) -> AmplifierLayer:
+        onset = Envelope(10, ((round(10_000 * level), 0),))
+        return layer(0, tone(level, 200.0, onset=onset), ramp=0.06)
+
+    account.refuse(0.0, sudden(0.9))
+    account.admit(0.0, sudden(0.1))
+    account.admit(0.15, sudden(0.9))
+
+
+def test_pulse_adds_to_the_rise_of_its_replacement() -> None:
+    """By hand: 0.9 in 20 ms, or pi/2 * 0.9 in 60 ms, and pi/2 * 0.05 in 60 ms: 69.9 per second."""
+    replacement = layer(0, tone(0.05), ramp=0.06)
+    account = Account(slew=69.9)
+    account.play(0.0, layer(0, LATE_PULSE))
+    account.admit(0.0, replacement)
+
+    account = Account(slew=69.8)
+    account.play(0.0, layer(0, LATE_PULSE))
+    account.refuse(0.0, replacement)
+
+
+def test_power_counts_all_layers_and_channels() -> None:
+    """Twice 0.5 is a power of 1 on one channel, and of 0.5 on two channels."""
+    account = Account(power=0.6)
+    account.play(0.0, layer(0, tone(0.5)))
+
+    account.refuse(1.0, layer(1, tone(0.5, 200.0)))
+    account.admit(1.0, layer(1, tone(0.5, 200.0, channel=1)))
+
+
+def test_rises_are_limited_but_fades_are_not() -> None:
+    """A ramp of 0.1 s to 0.5 rises at most by pi/2 * 0.5 / 0.1 = 7.85 per second, a knot by 10."""
+    rising = layer(0, tone(0.5), ramp=0.1)
+    onset = Envelope(100, ((1000, 0), (2000, 0)))
+    shaped = layer(0, tone(0.2, onset=onset))
+    Account(slew=7.86).admit(0.0, rising)
+    slow = Account(slew=7.85)
+    slow.refuse(0.0, rising)
+    slow.refuse(0.0, shaped)
+
+    account = Account(slew=10.01)
+    account.admit(0.0, shaped)
+    account.play(0.0, rising)
+    account.admit(1.0, layer(0, ramp=0.001))
+
+
+def test_on_time_limits_validity_and_ramps() -> None:
+    """Of 2 s, a ramp takes 20 ms; after 1.5 s, the rest less 100 ms for the way is left."""
+    account = Account(on_time=2.0)
+    assert account.play(0.0, layer(0, tone())).valid_for == 1980
+    assert account.admit(1.5, layer(1, tone(channel=1))).valid_for == 380
+    account.refuse(1.9, layer(0, renew=True))
+    assert account.admit(1.9, layer(0, ramp=1.0)).ramp <= 100
+
+
+def test_on_time_ends_with_a_layer_of_level_zero() -> None:
+    """One layer ends by itself at 2 s, the other by tones of level 0 at 1 s."""
+    account = Account(on_time=5.0)
+    account.play(0.0, layer(0, tone(0.3), valid_for=2.0))
+    account.play(0.0, layer(1, tone(0.3, channel=1), valid_for=2.0))
+    account.play(1.0, layer(1, tone(0.0), tone(0.0, channel=1)))
+
+    assert account.admit(6.0, layer(0, tone(), valid_for=1.0)).valid_for == 1000
+
+
+def test_on_time_includes_the_onset_that_a_set_waits_for() -> None:
+    """Of 2 s, 0.5 are over, the onset lasts 0.5 more, 0.1 may be on the way and 0.1 is the ramp.
+
+    The waiting set may last for 0.8 s from where it starts.
     """
+    account = Account(on_time=2.0)
+    onset = Envelope(1000, ((1000, 0),) * 9)
+    account.play(0.0, layer(0, tone(onset=onset), ramp=0.1, valid_for=1.5))
 
-    at: float
-    layer: AmplifierLayer
-    plays: bool = False
-    is_refused: bool = False
-    until: float | EllipsisType | None = ...
-    valid_for: tuple[int, int] = (0, 65_535)
-    longest: int = 65_535
+    waiting = account.admit(0.5, layer(0, tone(keep_phase=True), ramp=0.1, after=True))
 
-
-plays = partial(Asked, plays=True)
-refused = partial(Asked, is_refused=True)
-HIGH = partial(tone, frequency=200.0)
-RISING = AmplifierLayer(0, (tone(),), ramp=0.1)
-SHAPED = AmplifierLayer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),))
-SWELLING = tone(level=0.05, onset=Envelope(500, ((500, 0),)))
-ENDING = tone(level=0.1, ending=Envelope(100, ((8000, 0),)))
-
-# Silent for 100 ms, at 0.9 after 120 and silent again after 140; such that it plays amid a ramp.
-PULSE = tone(level=0.0, onset=Envelope(200, ((0, 0),) * 5 + ((9000, 0),)))
-
-LOW_SOON = Envelope(200, ((9000, 0),) + ((500, 0),) * 6)
+    assert waiting.valid_for == pytest.approx(800, abs=2)
 
 
-def sudden(level: float) -> AmplifierLayer:
-    """A layer whose tone is there within 2 ms, while what it replaces fades for 60 ms."""
-    shape = Envelope(10, ((round(10_000 * level), 0),))
-    return AmplifierLayer(0, (HIGH(level=level, onset=shape),), ramp=0.06)
+def test_duty_cycle_counts_vibration_within_ten_seconds() -> None:
+    """Of 2 s, two of 0.5 s and three ramps of 20 ms leave 0.94 s, less 0.1 s for each delay."""
+    account = Account(duty=0.2)
+    account.play(0.0, layer(0, tone(), valid_for=0.5))
+    account.play(2.0, layer(0, tone(), valid_for=0.5))
+
+    assert 740 <= account.admit(4.0, layer(0, tone())).valid_for <= 940
 
 
-PIECE = tone(level=0.9, keep_phase=True, onset=Envelope(1000, ((9000, 0),)))
-LOUD_END = tone(0, 1.0, 200.0, ending=Envelope(100, ((10000, 0),) * 10))
-LASTING = AmplifierLayer(0, (tone(),), ramp=0.0)
+def test_new_capabilities_do_not_restore_the_duty_cycle() -> None:
+    """0.9 of one second in ten is spent; a lower level limit leaves 0.1 s, reopened or not."""
+    account = Account(duty=0.1)
+    lasting = layer(0, tone(), ramp=0.0)
+    account.play(0.0, lasting)
+    account.play(0.9, layer(0, ramp=0.0))
+
+    account.ledger.adopt({**CAPABILITIES, "level_max": 5000})
+    account.refuse(5.0, layer(0, tone(0.51)))
+    assert 1 <= account.admit(5.0, lasting).valid_for <= 100
+
+    reopened = Account({**CAPABILITIES, "level_max": 4000}, duty=0.1)
+    reopened.ledger.go_on_from(account.ledger)
+    assert 1 <= reopened.admit(5.0, layer(0, tone(0.3), ramp=0.0)).valid_for <= 100
 
 
-def achieves(level: float, token: int) -> Callable[[Ledger], None]:
-    """What 0.45 has become in the set with this token."""
+def test_achieved_level_counts_once_its_set_is_reported() -> None:
+    """0.5 was sent and 0.45 plays, which leaves 0.55; a report about another set is ignored."""
+    account = Account()
+    account.play(0.0, layer(0, tone(0.5)))
+    achieved = account.admit(0.5, layer(0, tone(0.45)))
 
-    def correct(ledger: Ledger) -> None:
-        (sent,) = ledger.admit([AmplifierLayer(0, (tone(level=level),))], 0.5)
-        ledger.playback.correct(sent, token)
+    account.ledger.playback.correct(achieved, account.token + 1)
+    account.refuse(1.0, layer(1, tone(0.54, 200.0)))
 
-    return correct
-
-
-def reopened(ledger: Ledger) -> Ledger:
-    """A ledger of other capabilities that goes on from one that had 0.1 of all time."""
-    other = Ledger(replace(WIDE, duty=0.1), {**CAN, "level_max": 4000})
-    other.go_on_from(ledger)
-    return other
+    account.ledger.playback.correct(achieved, account.token)
+    account.refuse(1.0, layer(1, tone(0.56, 200.0)))
+    account.admit(1.0, layer(1, tone(0.54, 200.0)))
 
 
-COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked | Callable[[Ledger], Ledger | None]]]] = {
-    # 0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted.
-    "layers are bounded together": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (tone(level=0.6),))),
-            refused(1.0, AmplifierLayer(1, (HIGH(level=0.41),))),
-            Asked(1.0, AmplifierLayer(1, (HIGH(level=0.4),))),
-            plays(1.0, AmplifierLayer(0, ())),
-            refused(1.01, AmplifierLayer(1, (HIGH(level=0.9),))),
-            Asked(1.03, AmplifierLayer(1, (HIGH(level=0.9),))),
-        ],
-    ),
-    # 0.6 fades for 20 ms from 1.0 on; what is too loud at any time has no such moment.
-    "a refusal says from when": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (tone(level=0.6),))),
-            plays(1.0, AmplifierLayer(0, ())),
-            refused(1.01, AmplifierLayer(1, (HIGH(level=0.9),)), until=1.02),
-            Asked(1.02 + 1e-9, AmplifierLayer(1, (HIGH(level=0.9),))),
-            plays(2.0, AmplifierLayer(0, (tone(level=0.6),))),
-            refused(3.0, AmplifierLayer(1, (HIGH(level=0.9),)), until=None),
-        ],
-    ),
-    # Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not.
-    "a set that waits counts with its ending": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (SWELLING,))),
-            plays(0.01, AmplifierLayer(0, (ENDING,), after=True)),
-            refused(0.02, AmplifierLayer(1, (HIGH(level=0.3),))),
-            Asked(0.02, AmplifierLayer(1, (HIGH(level=0.15),))),
-        ],
-    ),
-    # 0.9 follows 0.9: one voice, unless its phase is new; 0.1 is left beside both.
-    "what waits goes on as one voice": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (PIECE,))),
-            refused(0.05, AmplifierLayer(0, (replace(PIECE, keep_phase=False),), after=True)),
-            refused(0.05, AmplifierLayer(0, (replace(PIECE, frequency=200.0),), after=True)),
-            plays(0.05, AmplifierLayer(0, (PIECE,), after=True)),
-            refused(0.06, AmplifierLayer(1, (HIGH(level=0.11),))),
-            Asked(0.06, AmplifierLayer(1, (HIGH(level=0.1),))),
-        ],
-    ),
-    # Gains of a raised cosine add up to one, in power to less than one.
-    "a cross-fade at full level": (
-        replace(WIDE, power=1.0),
-        [
-            plays(0.0, AmplifierLayer(0, (tone(0, 1.0),))),
-            Asked(1.0, AmplifierLayer(0, (tone(0, 1.0, 200.0),))),
-            Asked(1.0, AmplifierLayer(0, (tone(1, 1.0, 200.0),))),
-        ],
-    ),
-    # An ending at full level 1 ms after the commit, amid a ramp of 1 s: with the old tone nearly 2.
-    "an ending amid a cross-fade": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (tone(0, 1.0),))),
-            refused(1.0, AmplifierLayer(0, (LOUD_END,), ramp=1.0, valid_for=0.001)),
-            Asked(1.0, AmplifierLayer(0, (tone(0, 1.0, 200.0),), ramp=1.0, valid_for=0.001)),
-        ],
-    ),
-    # A set that comes after 80 ms or later lets a pulse go on, which ends before its ramp does.
-    "a pulse that ends before a ramp": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (PULSE,))),
-            refused(0.0, sudden(0.9)),
-            Asked(0.0, sudden(0.1)),
-            Asked(0.15, sudden(0.9)),
-        ],
-    ),
-    # It goes on (0.9 in 20 ms) or fades (pi/2 · 0.9 in 60), beside pi/2 · 0.05 in 60: 69.9.
-    "a pulse that beats with what follows": (
-        replace(WIDE, slew=69.9),
-        [
-            plays(0.0, AmplifierLayer(0, (PULSE,))),
-            Asked(0.0, AmplifierLayer(0, (tone(level=0.05),), ramp=0.06)),
-        ],
-    ),
-    "a pulse that beats too fast": (
-        replace(WIDE, slew=69.8),
-        [
-            plays(0.0, AmplifierLayer(0, (PULSE,))),
-            refused(0.0, AmplifierLayer(0, (tone(level=0.05),), ramp=0.06)),
-        ],
-    ),
-    # 0.5 in two layers of one channel: 1, in two channels: a half.
-    "power of all layers and channels": (
-        replace(WIDE, power=0.6),
-        [
-            plays(0.0, AmplifierLayer(0, (tone(0),))),
-            refused(1.0, AmplifierLayer(1, (HIGH(0),))),
-            Asked(1.0, AmplifierLayer(1, (HIGH(1),))),
-        ],
-    ),
-    # pi/2 · 0.5 / 0.1 s = 7.85 per second along a ramp; 10 by a knot; a fade never rises.
-    "a rise": (replace(WIDE, slew=7.86), [Asked(0.0, RISING)]),
-    "a rise that is too fast": (
-        replace(WIDE, slew=7.85),
-        [refused(1.0, RISING), refused(1.0, SHAPED)],
-    ),
-    "a fade": (
-        replace(WIDE, slew=10.01),
-        [Asked(0.0, SHAPED), plays(0.0, RISING), Asked(1.0, AmplifierLayer(0, (), ramp=0.001))],
-    ),
-    # 2 s: 1.98 s and a ramp of 20 ms; after 1.5 s of it the rest less 100 ms of way.
-    "on-time": (
-        replace(WIDE, on_time=2.0),
-        [
-            plays(0.0, AmplifierLayer(0, (tone(),)), valid_for=(1980, 1980)),
-            Asked(1.5, AmplifierLayer(1, (tone(1),)), valid_for=(380, 380)),
-            refused(1.9, AmplifierLayer(0, renew=True)),
-            Asked(1.9, AmplifierLayer(0, (), ramp=1.0), longest=100),
-        ],
-    ),
-    # Nothing vibrates from 2 s on: one layer ends by itself, the other at 1 s by tones of level 0.
-    "a layer that was ended by level zero": (
-        replace(WIDE, on_time=5.0),
-        [
-            plays(0.0, AmplifierLayer(0, (tone(0, level=0.3),), valid_for=2.0)),
-            plays(0.0, AmplifierLayer(1, (tone(1, level=0.3),), valid_for=2.0)),
-            plays(1.0, AmplifierLayer(1, (tone(0, level=0.0), tone(1, level=0.0)))),
-            Asked(6.0, AmplifierLayer(0, (tone(),), valid_for=1.0), valid_for=(1000, 1000)),
-        ],
-    ),
-    # 2 s of 10 s: after two of 0.5 s and a ramp of 20 ms, 0.94 s and such a ramp are left; each may
-    # have been played up to 0.1 s later.
-    "duty": (
-        replace(WIDE, duty=0.2),
-        [
-            plays(0.0, AmplifierLayer(0, (tone(),), valid_for=0.5)),
-            plays(2.0, AmplifierLayer(0, (tone(),), valid_for=0.5)),
-            Asked(4.0, AmplifierLayer(0, (tone(),)), valid_for=(740, 940)),
-        ],
-    ),
-    # 0.9 of one second within ten; a lower level limit does not give it back, reopened or not.
-    "other capabilities leave what was spent": (
-        replace(WIDE, duty=0.1),
-        [
-            plays(0.0, LASTING),
-            plays(0.9, AmplifierLayer(0, (), ramp=0.0)),
-            lambda ledger: ledger.adopt({**CAN, "level_max": 5000}),
-            refused(5.0, AmplifierLayer(0, (tone(level=0.51),))),
-            Asked(5.0, LASTING, valid_for=(1, 100)),
-            reopened,
-            Asked(5.0, AmplifierLayer(0, (tone(level=0.3),), ramp=0.0), valid_for=(1, 100)),
-        ],
-    ),
-    # 0.5 was sent, 0.45 plays: 0.54 beside it is admitted, 0.56 is not; of another set nothing is.
-    "what was achieved counts from then on": (
-        WIDE,
-        [
-            plays(0.0, AmplifierLayer(0, (tone(level=0.5),))),
-            achieves(0.45, token=2),
-            refused(1.0, AmplifierLayer(1, (HIGH(level=0.54),))),
-            achieves(0.45, token=1),
-            refused(1.0, AmplifierLayer(1, (HIGH(level=0.56),))),
-            Asked(1.0, AmplifierLayer(1, (HIGH(level=0.54),))),
-        ],
-    ),
-    # Of 2 s, 0.5 have gone by, ten steps of an onset last 0.5 more, and 0.1 may be on the way. A
-    # ramp of 0.1 s is left for its end: it may last for 0.8 s from where it begins.
-    "what waits for an onset ends within the longest vibration": (
-        replace(WIDE, on_time=2.0),
-        [
-            plays(
-                0.0,
-                AmplifierLayer(
-                    0,
-                    (tone(onset=Envelope(1000, ((1000, 0),) * 9)),),
-                    ramp=0.1,
-                    valid_for=1.5,
-                ),
-            ),
-            Asked(
-                0.5,
-                AmplifierLayer(0, (tone(keep_phase=True),), ramp=0.1, after=True),
-                valid_for=(798, 802),
-            ),
-        ],
-    ),
-    # Three sets a second; silence is never refused.
-    "rate": (
-        replace(WIDE, rate=3.0),
-        [
-            *(plays(0.1 * number, AmplifierLayer(0, (tone(),))) for number in range(3)),
-            refused(0.5, AmplifierLayer(0, (tone(),)), until=1.1),
-            Asked(0.5, AmplifierLayer(0, ())),
-            Asked(1.11, AmplifierLayer(0, (tone(),))),
-        ],
-    ),
-}
+def test_rate_of_sets_is_limited_but_silence_is_not() -> None:
+    """Three sets per second, at 0, 0.1 and 0.2 s, 0.1 s of which they may be late."""
+    account = Account(rate=3.0)
+    for time in (0.0, 0.1, 0.2):
+        account.play(time, layer(0, tone()))
+
+    assert account.refuse(0.5, layer(0, tone())).until == pytest.approx(1.1)
+    account.admit(0.5, layer(0))
+    account.admit(1.11, layer(0, tone()))
 
 
-@pytest.mark.parametrize("name", COURSES)
-def test_ledger_admits_what_is_within_the_limits(name: str) -> None:
-    """Each set of a course, with what was played before; a refusal names the first channel.
+LOUD = layer(2, tone(0.9, 200.0))
+"""Too loud together with any tone above 0.1."""
 
-    In between it may learn of something else.
+
+@pytest.fixture
+def late_account() -> Account:
+    """Return a ledger of an amplifier with eight voices."""
+    return Account({**CAPABILITIES, "voices": 8})
+
+
+def test_late_silence_may_leave_a_pulse_playing(late_account: Account) -> None:
+    """By hand: from 85 ms on, a silence along 60 ms leaves the pulse, which is over at 140 ms.
+
+    The silence arrives at 75 to 85 ms.
     """
-    limits, course = COURSES[name]
-    ledger = Ledger(limits, CAN)
-    for token, asked in enumerate(course, start=1):
-        if not isinstance(asked, Asked):
-            ledger = asked(ledger) or ledger
-            continue
-        if asked.is_refused:
-            error = refusal(ledger, asked.layer, at=asked.at)
-            assert error.channel in (0, None)
-            assert asked.until in (..., error.until and pytest.approx(error.until)), asked
-            continue
-        (one,) = ledger.admit([asked.layer], asked.at)
-        assert asked.valid_for[0] <= one.valid_for <= asked.valid_for[1]
-        assert one.ramp <= asked.longest
-        if asked.plays:
-            play(ledger, token, asked.at, asked.layer)
+    late_account.play(0.0, layer(0, LATE_PULSE), delay=0.01)
+
+    late_account.ledger.note_ended(0.06, 0.075, 0.085)
+
+    late_account.refuse(0.1, LOUD)
+    late_account.admit(1.075, LOUD)
 
 
-# Each played up to 10 ms after it was sent; None: silence. 0.9 beside what may go on is too much.
-LATE: Mapping[str, Sequence[tuple[float, AmplifierLayer | None]]] = {
-    # Silence from 85 ms on along 60 ms leaves a pulse that is over after 140; from 75 ms on not.
-    "a pulse that silence lets go on": [(0.0, AmplifierLayer(0, (PULSE,))), (0.075, None)],
-    # 0.9 at 20 ms and little more until 160: if it plays late, it fades at 31 ms from nearly there.
-    "a fade where a pulse is low": [
-        (0.0, AmplifierLayer(0, (tone(level=0.0, onset=LOW_SOON),))),
-        (0.031, AmplifierLayer(0, (), ramp=0.13)),
-    ],
-    # Of eight voices, at 1.1 all sound and 0.5 is cut short for a ninth; at 1.11 one is over.
-    "a fade that is not cut short": [
-        (0.0, AmplifierLayer(0, (tone(level=0.5),))),
-        *((0.1 * number, AmplifierLayer(number, (tone(level=0.01),))) for number in range(1, 8)),
-        (1.0, AmplifierLayer(0, (), ramp=1.0)),
-        (1.055, AmplifierLayer(1, (), ramp=0.05)),
-        (1.1, AmplifierLayer(0, (tone(level=0.01),))),
-    ],
-}
+def test_late_fade_may_start_from_a_higher_level(late_account: Account) -> None:
+    """0.9 at 20 ms and little until 160 ms: started 10 ms late, it fades from nearly 0.9."""
+    onset = Envelope(200, ((9000, 0),) + ((500, 0),) * 6)
+    late_account.play(0.0, layer(0, tone(0.0, onset=onset)), delay=0.01)
+
+    late_account.play(0.031, layer(0, ramp=0.13), delay=0.01)
+
+    late_account.refuse(0.056, LOUD)
+    late_account.admit(1.031, LOUD)
 
 
-@pytest.mark.parametrize("name", LATE)
-def test_what_a_commit_may_leave_playing_if_it_comes_late_counts(name: str) -> None:
-    """Each set may have been played when it was sent or 10 ms later; all is over a second later."""
-    ledger, at = Ledger(WIDE, {**CAN, "voices": 8}), 0.0
-    for token, (at, layer) in enumerate(LATE[name], 1):
-        if layer is None:
-            ledger.note_ended(0.06, at, at + 0.01)
-        else:
-            ledger.sent(token, ledger.admit([layer], at), at)
-            ledger.resolve(token, at + 0.01)
-    loud = AmplifierLayer(2, (HIGH(level=0.9),))
-    refusal(ledger, loud, at=at + 0.025)
-    assert ledger.admit([loud], at + 1.0)
+def test_late_set_may_leave_a_fade_that_it_would_cut_short(late_account: Account) -> None:
+    """At 1.1 s all eight voices sound and 0.5 is cut short for a ninth; at 1.11 s one is over."""
+    late_account.play(0.0, layer(0, tone(0.5)), delay=0.01)
+    for number in range(1, 8):
+        late_account.play(0.1 * number, layer(number, tone(0.01)), delay=0.01)
+    late_account.play(1.0, layer(0, ramp=1.0), delay=0.01)
+    late_account.play(1.055, layer(1, ramp=0.05), delay=0.01)
+
+    late_account.play(1.1, layer(0, tone(0.01)), delay=0.01)
+
+    late_account.refuse(1.125, LOUD)
+    late_account.admit(2.1, LOUD)
 
 
-def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:
-    """Whatever goes wrong in checking: refused, nothing is noted, and a silent set is admitted."""
-    ledger = Ledger(WIDE, CAN)
-    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(),)))
-    broken = replace(tone(1), onset=object())  # type: ignore[arg-type]
-    refusal(ledger, AmplifierLayer(1, (broken,)))
-    assert ledger.doubt is None
-    assert ledger.playback.tokens == {0: 1}
-    assert ledger.admit([AmplifierLayer(0, ())], 1.0)
+def test_failing_check_refuses_and_leaves_silence_possible() -> None:
+    """An exception in a check is a refusal; nothing is noted, and a silent set is admitted."""
+    account = Account()
+    account.play(0.0, layer(0, tone()))
+    broken = tone(channel=1, onset=object())
+
+    account.refuse(1.0, layer(1, broken))
+
+    assert account.ledger.doubt is None
+    assert account.ledger.playback.tokens == {0: 1}
+    account.admit(1.0, layer(0))
 
 
-def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
-    """By confirmation, or by a status with another token; nothing is kept of refused sets."""
-    ledger = Ledger(WIDE, CAN)
-    layer = AmplifierLayer(0, (tone(),))
-    ledger.sent(7, ledger.admit([layer], 0.0), 0.0)
+def test_set_in_doubt_admits_only_silence_until_it_is_resolved() -> None:
+    """A status with another token shows that it does not play, one with its own that it does."""
+    account = Account()
+    ledger = account.ledger
+    single = layer(0, tone(0.5))
+    ledger.sent(7, ledger.admit([single], 0.0), 0.0)
+    assert ledger.doubt
     assert ledger.doubt.token == 7
-    refusal(ledger, layer)
-    assert ledger.admit([AmplifierLayer(0, ())], 1.0)
+    account.refuse(1.0, single)
+    account.admit(1.0, layer(0))
+
     ledger.resolve(6, 1.0)
-    assert (ledger.doubt, ledger.playback.level(0, 1.0)) == (None, 0.0)
-    ledger.sent(8, ledger.admit([layer], 1.0), 1.0)
+    assert ledger.doubt is None
+    assert ledger.playback.level(0, 1.0) == 0.0
+
+    ledger.sent(8, ledger.admit([single], 1.0), 1.0)
     ledger.resolve(8, 1.01)
     assert ledger.playback.level(0, 2.0) == pytest.approx(0.5)
 
 
-def random_layer(random_: random.Random, number: int) -> AmplifierLayer:
-    """A layer of up to three tones of three frequencies, with shapes, fades and ends."""
+def random_envelope(chance: random.Random) -> Envelope | None:
+    """Return no envelope, or one of up to three knots."""
+    if chance.random() < 0.6:
+        return None
+    knots = []
+    for _ in range(chance.randrange(4)):
+        knots.append((chance.randrange(5000), chance.randrange(-18000, 18000)))
+    return Envelope(chance.choice((20, 100)), tuple(knots))
 
-    def shape() -> Envelope | None:
-        if random_.random() < 0.6:
-            return None
-        knots = [(random_.randrange(5000), random_.randrange(-18000, 18000)) for _ in range(3)]
-        return Envelope(random_.choice((20, 100)), tuple(knots[: random_.randrange(4)]))
 
-    tones = tuple(
-        AmplifierTone(
+def random_layer(chance: random.Random, number: int) -> AmplifierLayer:
+    """Return a layer of up to three tones of three frequencies, with shapes, fades and ends."""
+    valid_for = chance.choice((0.0, 0.05, 0.2))
+    if valid_for and chance.random() < 0.1:
+        return layer(number, renew=True, valid_for=valid_for)
+    tones = []
+    for channel in chance.sample(range(3), chance.randrange(4)):
+        random_tone = tone(
+            chance.choice((0.0, 0.2, 0.4, 0.7)),
+            chance.choice((100.0, 150.0, 200.0)),
             channel,
-            random_.choice((100.0, 150.0, 200.0)),
-            random_.choice((0.0, 0.2, 0.4, 0.7)),
-            random_.uniform(-180, 180),
-            keep_phase=random_.random() < 0.5,
-            skip_ending=random_.random() < 0.3,
-            onset=shape(),
-            ending=shape(),
+            phase=chance.uniform(-180, 180),
+            keep_phase=chance.random() < 0.5,
+            skip_ending=chance.random() < 0.3,
+            onset=random_envelope(chance),
+            ending=random_envelope(chance),
         )
-        for channel in random_.sample(range(3), random_.randrange(4))
-    )
-    ramp = random_.choice((0.005, 0.02, 0.08)) if tones else 0.08  # silence is never refused
-    valid_for = random_.choice((0.0, 0.05, 0.2))
-    if valid_for and random_.random() < 0.1:
-        return AmplifierLayer(number, renew=True, valid_for=valid_for)
-    return AmplifierLayer(
-        number, tones, ramp, valid_for, after=bool(tones) and random_.random() < 0.2
-    )
+        tones.append(random_tone)
+    if not tones:
+        return layer(number, ramp=0.08, valid_for=valid_for)
+    ramp = chance.choice((0.005, 0.02, 0.08))
+    waits = chance.random() < 0.2
+    return layer(number, *tones, ramp=ramp, valid_for=valid_for, after=waits)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: int) -> None:
-    """Random sets, each played up to 90 ms after it was sent: level, power and rise every 0.5 ms.
+def test_admitted_sets_stay_within_the_limits_whenever_they_are_played(seed: int) -> None:
+    """Random sets play up to 90 ms after they were sent: level, power and rise every 0.5 ms.
 
     A jump of a ramp counts within one step of the sampling.
     """
-    random_ = random.Random(seed)
-    limits = replace(WIDE, level=0.9, power=1.2, slew=random_.choice((60.0, 150.0, math.inf)))
-    ledger, plays = Ledger(limits, CAN), Playback(3, 16)
-    now, step, admitted = 0.0, 0.0005, 0
-    before = [0.0] * 3
+    chance = random.Random(seed)
+    slew = chance.choice((60.0, 150.0, math.inf))
+    ledger = Account(level=0.9, power=1.2, slew=slew).ledger
+    playback = Playback(3, 16)
+    now = 0.0
+    step = 0.0005
+    admitted_sets = 0
+    earlier_levels = [0.0] * 3
     for token in range(1, 120):
-        numbers = random_.sample(range(3), random_.choice((1, 1, 2)))
+        numbers = chance.sample(range(3), chance.choice((1, 1, 2)))
+        layers = [random_layer(chance, number) for number in numbers]
         try:
-            layers = ledger.admit([random_layer(random_, number) for number in numbers], now)
+            waiting = ledger.admit(layers, now)
         except CommandRefused:
-            layers = ()
-        commit = now + random_.choice((0.0, 0.001, 0.01, 0.09))
-        until = max(commit + 0.002, now + random_.choice((0.012, 0.03, 0.1)))
-        if layers:
-            admitted += 1
-            ledger.sent(token, layers, now)
-        while now < until:
+            waiting = ()
+        commit = now + chance.choice((0.0, 0.001, 0.01, 0.09))
+        end = max(commit + 0.002, now + chance.choice((0.012, 0.03, 0.1)))
+        if waiting:
+            admitted_sets += 1
+            ledger.sent(token, waiting, now)
+        while now < end:
             now += step
-            if layers and now >= commit:
-                plays.commit(layers, token, commit)
-                layers = ()
-            plays.advance(now)
-            levels = [plays.level(channel, now) for channel in range(3)]
+            if waiting and now >= commit:
+                playback.commit(waiting, token, commit)
+                waiting = ()
+            playback.advance(now)
+            levels = [playback.level(channel, now) for channel in range(3)]
             assert max(levels) <= 0.9 * (1 + 1e-6)
-            assert sum(level**2 for level in levels) <= 1.2 * (1 + 1e-6)
-            rises = [(new - old) / step for new, old in zip(levels, before, strict=True)]
-            assert max(rises) <= limits.slew * (1 + 1e-6)
-            before = levels
-        ledger.resolve(token, min(commit + 0.001, until))
-    assert admitted > 20
-
-
-@in_virtual_time
-async def test_read_behind_a_write_whose_response_was_found_late_is_awaited() -> None:
-    """Modbus: only the last look at the port finds that response; the status comes 20 ms on."""
-    end = MemoryLine("tcp", "a")
-    (host,) = end.hosts.values()
-    await host.open()
-    unread: list[bytes] = []
-
-    def poll() -> None:
-        end.outward = lambda name, data: [(0.02, data)]
-        while unread:
-            end.line.received(unread.pop())
-
-    end.poll = poll  # type: ignore[method-assign]
-    end.outward = lambda name, data: unread.append(data) or []  # type: ignore[func-returns-value]
-    await host.read_status()
-    assert host.counts.retries == 0
-
-
-IN_PLACE: Mapping[str, tuple[str, Callable[[bytes], bytes], str]] = {
-    # What stands in place of each reply, by hand, and what the error must name.
-    "serial, wrong speed": ("serial", lambda data: b"\xf8\x80" * 9, "bytes .*f8 80.*baud rate"),
-    "serial, damaged": (
-        "serial",
-        lambda data: data[:-5] + b"\1" + data[-4:],
-        "no valid frame.*cable",
-    ),
-    "serial, echo": (
-        "serial",
-        lambda data: encode_frame(Frame(9, 1, 4, b"", 3)),
-        "request itself came back",
-    ),
-    "serial, late": (
-        "serial",
-        lambda data: encode_frame(Frame(0x89, 1, 3, b"", 3)),
-        "address 1 to another request.*delays",
-    ),
-    "rtu, wrong speed": ("rtu", lambda data: b"\xf8\x80" * 9, "18 bytes .*f8 80.*parity"),
-    "can, text that is none": ("can", lambda data: frames((0x800, b"\xf8")), r"\(f8\).*baud rate"),
-    "rtu, other unit": (
-        "rtu",
-        lambda data: bytes.fromhex("02 90 01 7d c0"),
-        "unit 2.*check the unit",
-    ),
-    "tcp, transaction 0": (
-        "tcp",
-        lambda data: b"\0\0" + data[2:],
-        "transaction 0, unit 1.*gateway",
-    ),
-    "tcp, unit 255": (
-        "tcp",
-        lambda data: data[:6] + b"\xff" + data[7:],
-        "unit 255.*check the unit",
-    ),
-    "tcp, exception 10": ("tcp", lambda data: data[:5] + b"\3\1\x90\x0a", "no path to unit 1"),
-    "tcp, exception 11": ("tcp", lambda data: data[:5] + b"\3\1\x90\x0b", "no response of unit 1"),
-    "tcp, RTU in it": ("tcp", lambda data: b"\1\x10\x09\0\0\1\2\x55", r"Modbus TCP.*modbus\+rtu"),
-    "can, other node": ("can", lambda data: frames((0x705, b"\5")), "node 5 came .* of node 1:"),
-    "can, heartbeat": (
-        "can",
-        lambda data: frames((0x701, b"\5"), (0x702, b"\5")),
-        "node 1 came in place of .* of node 1:",
-    ),
-    "can, BEL": ("can", lambda data: frames((0x800, b"\7")), r"adapter .*\(07\).*termination"),
-}
-
-
-def frames(*given: tuple[int, bytes]) -> bytes:
-    """Frames by identifier and data, as a port of frames has them."""
-    return pack_frames(starmap(CanFrame, given))
-
-
-@pytest.mark.parametrize("case", IN_PLACE)
-@in_virtual_time
-async def test_error_of_no_reply_names_what_came_in_its_place(case: str) -> None:
-    """And what to check, which differs; as does the reason why nothing new is played."""
-    wire, in_place, named = IN_PLACE[case]
-    end = MemoryLine(wire, "a")
-    (host,) = end.hosts.values()
-    await host.open()
-    end.outward = lambda name, data: [(0.0002, in_place(data))]
-    with pytest.raises(LinkTimeout, match=f"no reply within 30 ms, but .*{named}"):
-        await host.read_status()
-    assert re.search(named, host.no_reply_cause or "")
-    end.outward = unaltered
-    await host.read_status()
-    end.outward = lambda name, data: []
-    with pytest.raises(LinkTimeout, match="30 ms; check that the amplifier is switched on"):
-        await host.read_status()
-    end = MemoryLine("serial", "a")  # its replies to Hello, of type 81, alone arrive
-    end.outward = lambda name, data: unaltered(name, data) * (data[2:3] == b"\x81")
-    with pytest.raises(LinkTimeout, match="; it answered Hello, but not GetCaps"):
-        await end.hosts["a"].open()
-
-
-@pytest.mark.parametrize(("wire", "named"), [("serial", "flow control"), ("can", "acknowledges")])
-@in_virtual_time
-async def test_error_of_a_port_that_takes_nothing_names_what_to_check(
-    wire: str, named: str
-) -> None:
-    """A bus on which no node acknowledges fills the queue of its adapter."""
-    end = MemoryLine(wire, "a")
-    end.is_blocked = True
-    end.inward = lambda name, data: []
-    with pytest.raises(LinkTimeout, match=named):
-        await end.hosts["a"].open()
-
-
-async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:
-    """Of requests that wait; what reads goes on waiting."""
-    result = asyncio.get_running_loop().create_future()
-    waiting = [Job(None, priority, "", 0.03, 0.0, result=result) for priority in Priority]
-    obsolete = {job.priority for job in waiting if job.is_superseded_by(Priority.STOP, None)}
-    assert obsolete == {Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR}
+            power = sum(level**2 for level in levels)
+            assert power <= 1.2 * (1 + 1e-6)
+            for level, earlier_level in zip(levels, earlier_levels, strict=True):
+                assert (level - earlier_level) / step <= slew * (1 + 1e-6)
+            earlier_levels = levels
+        ledger.resolve(token, min(commit + 0.001, end))
+    assert admitted_sets > 20

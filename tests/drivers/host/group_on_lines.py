@@ -134,15 +134,18 @@ class Rig:
 
 
 async def connect(
-    *lines: str, wire: str, is_armed: bool = True, baud: int = 0, watchdog: float = 0.25
+    *lines: str, wire: str, is_armed: bool = True, baud: int = 0, **options: Any
 ) -> Rig:
-    """Return an open group of amplifiers, a letter each on each line; baud: of serial lines."""
+    """Return an open group of amplifiers, a letter each on each line.
+
+    baud: of serial lines; options: of the group.
+    """
     ends = []
     for names in lines:
         host_wire = SerialWire(baud, sequence=0) if baud else None
         ends.append(MemoryLine(wire, *names, wire=host_wire))
     draw = random.Random(7).randint
-    return Rig(ends, await group_of(*ends, is_armed=is_armed, watchdog=watchdog, draw=draw))
+    return Rig(ends, await group_of(*ends, is_armed=is_armed, draw=draw, **options))
 
 
 async def begin(request: Awaitable[_T]) -> "asyncio.Future[_T]":

@@ -84,9 +84,12 @@ async def test_faulty_clock_is_reported_and_stops_nothing(lines: str, case: str)
         await rig.beat(1)
 
     problem = "clock_not_steered" if case == "not steered" else "clock_jumped"
+    allowed = {problem, "clock_unsettled"}
+    if case in ("stands still", "runs backwards"):
+        allowed.add("clock_rate")
     reported = set(rig.hosts["a"].reported_at)
     assert problem in reported
-    assert reported <= {problem, "clock_unsettled", "clock_rate"}
+    assert reported <= allowed
     assert rig.group.clock_errors["a"] > 0.1 or lines == "a"
     assert (await rig.stop())["a"]
     assert rig.levels["a"] == SILENT

@@ -1,15 +1,12 @@
-"""Layouts designed for contrast, against enumeration, symmetry and the answers of tables.
-
-Also the files that say where ERAs may stand and where fingers touch, and designs on several
-machines.
-"""
+"""Layouts designed for contrast, against enumeration, symmetry and the answers of tables."""
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,34 +40,51 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import attached_stiffness
-from model.structure.sources import Era, drive_forces
+from model.structure.sources import drive_forces
 from model.structure.statics import static_loads
+
+RIG = load_rig(example_rig_path())
+PLATE = RIG.plate
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few layouts together."""
+    """Few layouts together, and two frequencies."""
     monkeypatch.setattr("era_haptics.lab.design.design_run.CHUNK", 4)
+    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
 
+
+def problem(rig: Rig = RIG, **changes: Any) -> DesignProblem:
+    """Return the problem of four ERAs along the edge of a plate."""
+    defaults = {
+        "count": 4,
+        "kept": (),
+        "area": area_of("edge", rig.plate),
+        "contacts": replace(anywhere(rig.plate), quiet=(1, 2)),
+        "apart": 0.03,
+        "lowest": 20.0,
+        "seed": 0,
+    }
+    return DesignProblem(rig=rig, **defaults | changes)
+
+
+# Runs
 
 COARSE = make_paper_rig(12, 9)
-FEW = tuple(anywhere(COARSE.plate).sets(3, seed=1))
-EDGE = area_of("edge", COARSE.plate), replace(anywhere(COARSE.plate), given=FEW)
+THREE_SETS = tuple(anywhere(COARSE.plate).sets(3, seed=1))
+EDGE = area_of("edge", COARSE.plate), replace(anywhere(COARSE.plate), given=THREE_SETS)
 """ERAs along the edge, judged by three contact sets."""
 
 
-def ranked(runner: Runner, *, seed: int = 0) -> Design:
-    """Ten layouts of four ERAs, two of them judged by three contact sets."""
-    some = DesignProblem(COARSE, 4, *EDGE, seed=seed)
-    return rank_layouts({some: layouts_of("random:10", some)}, finalists=2, runner=runner)
-
-
-def figures(design: Design) -> bytes:
-    """All numbers of a design."""
-    rows = [
-        [*each.found.positions.ravel(), each.found.score_db, each.mean_db if each.judged else 0]
-        for each in design.layouts
-    ]
+def figures_by(runner: Runner) -> bytes:
+    """Return all numbers of a design of ten layouts with four ERAs, two of them judged."""
+    design_problem = DesignProblem(COARSE, 4, *EDGE, seed=0)
+    layouts = {design_problem: layouts_of("random:10", design_problem)}
+    design: Design = rank_layouts(layouts, finalists=2, runner=runner)
+    rows = []
+    for layout in design.layouts:
+        contrast = layout.mean_db if layout.judged else 0
+        rows.append([*layout.found.positions.ravel(), layout.found.score_db, contrast])
     return np.array(rows).tobytes()
 
 
@@ -80,48 +94,47 @@ def test_processes_and_a_cluster_find_the_same_to_the_bit() -> None:
     import dask  # takes a second
     from distributed import LocalCluster
 
-    here = figures(ranked(Runner()))
-    assert figures(ranked(Runner(machines=partial(on_processes, 2)))) == here
+    by_one = figures_by(Runner())
+    by_two = figures_by(Runner(machines=partial(on_processes, 2)))
     with (
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as running,
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
     ):
-        there = Runner(machines=partial(on_cluster, running.scheduler_address))
-        assert figures(ranked(there)) == here
+        by_cluster = figures_by(Runner(machines=partial(on_cluster, cluster.scheduler_address)))
+
+    assert by_two == by_one
+    assert by_cluster == by_one
 
 
-def test_a_layout_is_judged_with_the_eras_of_its_problem() -> None:
-    """The same places with ERAs of two stiffnesses: each has the answers of its own rig."""
-    soft, stiff = (DesignProblem(COARSE, 4, *EDGE, stiffness=each) for each in (1e4, 3e4))
+def test_layout_is_judged_with_the_eras_of_its_problem() -> None:
+    """The same positions with ERAs of two stiffnesses: each has the answers of its own rig."""
+    soft = DesignProblem(COARSE, 4, *EDGE, stiffness=1e4)
+    stiff = DesignProblem(COARSE, 4, *EDGE, stiffness=3e4)
     corners = {"corners": soft.own_positions}
-    found = rank_layouts({soft: corners, stiff: corners}, finalists=1, runner=Runner())
-    for each in found.layouts:
-        alone = assess(each.problem.rig_with(soft.own_positions), FEW)
-        assert sorted(each.answers.contrast_db) == pytest.approx(sorted(alone.contrast_db))
+
+    design = rank_layouts({soft: corners, stiff: corners}, finalists=1, runner=Runner())
+
+    for layout in design.layouts:
+        rig = layout.problem.rig_with(soft.own_positions)
+        expected = sorted(assess(rig, THREE_SETS).contrast_db)
+        assert sorted(layout.answers.contrast_db) == pytest.approx(expected)
 
 
-def test_layouts_of_exciters_state_their_own_keys() -> None:
-    """A suspension by stiffness and damping takes the place of resonance and q, and reads back."""
+def test_layouts_of_exciters_have_their_own_keys() -> None:
+    """A suspension by stiffness and damping replaces resonance and q, and reads back."""
     text = exciter_rig_text("type: DAEX25CT-4, resonance: 300, resonance_is: free, q: 4")
     rig = parse_rig("board.yaml", text)
     area, contacts = area_of("edge", rig.plate), anywhere(rig.plate)
-    sought = DesignProblem(rig, 4, area, contacts, stiffness=5e3)
+    board = DesignProblem(rig, 4, area, contacts, stiffness=5e3)
     places = np.array([[0.05, 0.04], [0.25, 0.04], [0.25, 0.19], [0.06, 0.18]])
-    keys = layout_keys(sought, places, parse_document("board.yaml", text).data)
-    found = parse_rig("layout.yaml", json.dumps(keys))
-    assert [(era.x, era.y) for era in found.eras] == [tuple(at) for at in places.tolist()]
-    assert [era.stiffness for era in found.eras] == [5e3] * 4
-    assert [era.damping for era in found.eras] == pytest.approx([rig.eras[0].damping] * 4, rel=1e-5)
 
+    keys = layout_keys(board, places, parse_document("board.yaml", text).data)
 
-RIG = load_rig(example_rig_path())
-PLATE = RIG.plate
-GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
-"""Errors of the gains only, 5 % and 5 degrees."""
-LOUD = replace(RIG, uncertainty=GAINS, eras=tuple(replace(era, stroke=0.01) for era in RIG.eras))
-"""Weights of any kind reach the level, so that it does not matter."""
-PAIRS = tuple(replace(anywhere(PLATE), quiet=(1, 1)).sets(4, seed=4))
-OF_PAIRS = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), PAIRS)
+    eras = parse_rig("layout.yaml", json.dumps(keys)).eras
+    np.testing.assert_array_equal([(exciter.x, exciter.y) for exciter in eras], places)
+    assert [exciter.stiffness for exciter in eras] == [5e3] * 4
+    damping = [rig.eras[0].damping] * 4
+    assert [exciter.damping for exciter in eras] == pytest.approx(damping, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -133,240 +146,283 @@ def test_refused_design_leaves_no_folder(
 ) -> None:
     """A range without its end, and an unknown ERA, are refused before anything is written."""
     folder = tmp_path / "out"
-    words = ["design", str(example_rig_path()), "-o", str(folder), "--where", "nosuch.yaml"]
-    assert run_era([*words, *options]) == 2
+    command = ["design", str(example_rig_path()), "-o", str(folder), "--where", "nosuch.yaml"]
+
+    assert run_era([*command, *options]) == 2
+
     assert cause in capsys.readouterr().err
     assert not folder.exists()
 
 
-def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
-    """Fingers are in the regions, so many of them, so far apart; effects are passed over."""
+# Contacts
+
+LAYOUT = """\
+quiet: [2, 2]
+apart: 4 cm
+elsewhere: null
+regions:
+  a: {rectangle: {start: [0, 0], end: [5 cm, 5 cm]}, on_press: click}
+  b: {circle: {at: [20 cm, 10 cm], radius: 4 cm}}
+"""
+
+
+def gaps_between(points: FloatArray) -> FloatArray:
+    """Return the distances of all pairs of points [m]."""
+    distances = np.linalg.norm(points[:, None] - points, axis=-1)
+    return np.asarray(distances[np.triu_indices(len(points), 1)])
+
+
+def test_contacts_are_in_the_regions_of_a_layout(tmp_path: Path) -> None:
+    """Three fingers, 4 cm apart; effects do not matter."""
     path = tmp_path / "layout.yaml"
-    path.write_text(
-        "quiet: [2, 2]\napart: 4 cm\nelsewhere: null\nregions:\n"
-        "  a: {rectangle: {start: [0, 0], end: [5 cm, 5 cm]}, on_press: click}\n"
-        "  b: {circle: {at: [20 cm, 10 cm], radius: 4 cm}}\n"
-    )
+    path.write_text(LAYOUT)
+
     rule = contact_rule(path, PLATE)
-    for contacts in [*rule.sets(20, seed=1), *rule.pooled_sets(10, seed=1)]:
+
+    for contacts in (*rule.sets(20, seed=1), *rule.pooled_sets(10, seed=1)):
         assert len(contacts) == 3
-        in_a = (contacts <= 0.05).all(axis=1)
-        in_b = np.hypot(*(contacts - [0.2, 0.1]).T) <= 0.04
-        assert (in_a | in_b).all()
-        gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
-        assert gaps[np.triu_indices(3, 1)].min() > 0.04
+        in_rectangle = np.all(contacts <= 0.05, axis=1)
+        in_circle = np.linalg.norm(contacts - [0.2, 0.1], axis=1) <= 0.04
+        np.testing.assert_array_equal(in_rectangle | in_circle, True, err_msg=str(contacts))
+        assert gaps_between(contacts).min() > 0.04
 
 
-def dense_score(
-    rig: Rig,
-    places: FloatArray,
-    sets: Sequence[FloatArray],
-    frequencies: FloatArray,
-) -> float:
-    """Mean score [dB] by the definition: one dense system for each set, frequency and finger.
+# Scores and a dense solve
 
-    With errors of the gains and of the thickness only, whose plates are solved anew, and one quiet
-    finger; the best weights are an eigenvector. ERAs at places (n, 2) [m], or (n, 3) with
-    their feet, are like the first.
+GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
+"""Errors of the gains only, 5 % and 5 degrees."""
+LONG_STROKES = tuple(replace(corner, stroke=0.01) for corner in RIG.eras)
+LOUD = replace(RIG, uncertainty=GAINS, eras=LONG_STROKES)
+"""Weights of any kind reach the level, so it does not matter."""
+PAIRS = tuple(replace(anywhere(PLATE), quiet=(1, 1)).sets(4, seed=4))
+OF_PAIRS = ContactRule((1, 1), 0.05, lambda rng, count: np.zeros((count, 2)), PAIRS)
+
+
+@dataclass(frozen=True)
+class DenseScore:
+    """The score of a layout by the definition: a dense system for each set, frequency and finger.
+
+    With errors of the gains and of the thickness only, whose plates are solved again, and a quiet
+    finger; the best weights are an eigenvector.
     """
-    plate, std = rig.plate, rig.uncertainty.frequency
-    plates = [
-        solve_free_plate(
-            replace(plate, thickness=h * plate.thickness),
-            rig.mesh,
-            frequency_max=float(frequencies.max()),
-        )
-        for h in ((1, 1 + std, 1 - std) if std else (1,))
-    ]
-    eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y, *_) in enumerate(places)]
-    omega = 2 * np.pi * frequencies
-    z, force = attached_stiffness(omega, eras), drive_forces(omega, eras)
-    tip = rig.fingertip.dynamic_stiffness(omega)
-    sigma2, found = rig.uncertainty.gain_variance, []
-    for contacts in sets:
-        best = []
+
+    rig: Rig
+    places: FloatArray
+    """Of ERAs like the first (n, 2) [m], or (n, 3) with their feet."""
+
+    def mean(self, sets: Sequence[FloatArray], frequencies: FloatArray) -> float:
+        """Return the mean over contact sets of the score at the best frequency [dB]."""
+        std = self.rig.uncertainty.frequency
+        plates = []
+        for factor in (1, 1 + std, 1 - std) if std else (1,):
+            plate = replace(self.rig.plate, thickness=factor * self.rig.plate.thickness)
+            plates.append(solve_free_plate(plate, self.rig.mesh, frequency_max=frequencies.max()))
+        scores = []
+        for contacts in sets:
+            by_frequency = [self.at(frequency, contacts, plates) for frequency in frequencies]
+            scores.append(max(by_frequency))
+        return float(np.mean(scores))
+
+    def at(self, frequency: float, contacts: FloatArray, plates: Sequence[FreePlate]) -> float:
+        """Return the score [dB] of a target and a quiet finger at a frequency [Hz]."""
+        plate = self.rig.plate
         tips, weights = fingertips_on(
             contacts, length=plate.length, width=plate.width, rule=FIVE_POINTS
         )
-        for row in range(len(frequencies)):
-            attached = z[row], tip[row], force[row]
-            target, quiet = (
-                [
-                    _field(free, places, finger, points, frequencies[row], attached)
-                    for free in plates
-                ]
-                for finger, points in zip(contacts, tips, strict=True)
-            )
-            mean = weights[0] @ target[0]
-            root = np.sqrt(weights[1])[:, None]
-            changes = [root * (other - quiet[0]) for other in quiet[1:]]
-            R = sum((0.5 * each.conj().T @ each for each in changes), 0)
-            R = R + (root * quiet[0]).conj().T @ (root * quiet[0])
-            R += sigma2 * np.diag((np.abs(root * quiet[0]) ** 2).sum(axis=0))
-            # Largest |h w|² / w^H R w is the one eigenvalue of R^-1 h* h^T.
-            values = np.linalg.eigvals(np.linalg.solve(R, np.outer(mean.conj(), mean)))
-            best.append(10 * np.log10(np.abs(values).max()))
-        found.append(max(best))
-    return float(np.mean(found))
+        target = weights[0] @ self.field(plates[0], frequency, contacts[0], tips[0])
+        root = np.sqrt(weights[1])[:, None]
+        fields = [root * self.field(free, frequency, contacts[1], tips[1]) for free in plates]
+        nominal = fields[0]
+        form = nominal.conj().T @ nominal
+        for changed in fields[1:]:
+            change = changed - nominal
+            form += 0.5 * change.conj().T @ change
+        powers = (np.abs(nominal) ** 2).sum(axis=0)
+        form += self.rig.uncertainty.gain_variance * np.diag(powers)
+        # The largest |h w|² / w^H R w is the one eigenvalue of R^-1 h* h^T.
+        ratios = np.linalg.eigvals(np.linalg.solve(form, np.outer(target.conj(), target)))
+        return float(10 * np.log10(np.abs(ratios).max()))
+
+    def field(
+        self, free: FreePlate, frequency: float, finger: FloatArray, points: FloatArray
+    ) -> ComplexArray:
+        """Return the accelerations (p, n) of each ERA alone, under a finger on the plate."""
+        omega = 2 * np.pi * np.array([frequency])
+        eras = []
+        for number, (x, y, *_) in enumerate(self.places):
+            eras.append(replace(self.rig.eras[0], name=str(number), x=x, y=y))
+        (stiffness,) = attached_stiffness(omega, eras)
+        (force,) = drive_forces(omega, eras)
+        tip = self.rig.fingertip.dynamic_stiffness(omega)
+        contact = np.resize([*finger, 0.0], self.places.shape[1])
+        (between,), (to,) = free.receptances(
+            np.vstack([self.places, contact]), points, np.array([frequency])
+        )
+        applied = np.vstack([np.diag(force), np.zeros(len(eras))])
+        loaded = np.eye(len(between)) + np.diag([*stiffness, *tip]) @ between
+        forces = np.linalg.solve(loaded, applied)
+        return np.asarray(-(omega**2) * to.T @ forces)
 
 
-def _field(
-    free: FreePlate,
-    places: FloatArray,
-    finger: FloatArray,
-    points: FloatArray,
-    frequency: float,
-    attached: tuple[ComplexArray, complex, ComplexArray],
-) -> ComplexArray:
-    """Acceleration at points (p, 2) under a finger on the plate, of each ERA alone: (p, n).
-
-    attached: dynamic stiffness of the ERAs (n,) and of the finger, force of the ERAs (n,).
-    """
-    z, tip, force = attached
-    at = np.vstack([places, np.resize([*finger, 0.0], places.shape[1])])
-    between, to = free.receptances(at, points, np.array([frequency]))
-    applied = np.vstack([np.diag(force), np.zeros(len(places))])
-    forces = np.linalg.solve(np.eye(len(at)) + np.diag([*z, tip]) @ between[0], applied)
-    return np.asarray(-((2 * np.pi * frequency) ** 2) * to[0].T @ forces)
+def score_of(design_problem: DesignProblem, places: FloatArray) -> float:
+    """Return the score of the search for a layout [dB]."""
+    (scored,) = LayoutSearch(design_problem).scored([places])
+    return float(scored.score_db)
 
 
-def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) -> None:
-    """The best of some starts is the best of all triples of ERAs that a dense solve gives."""
+def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The best of some starts is the best of all triples of ERAs by a dense solve."""
     monkeypatch.setitem(problem_module.CANDIDATES, True, 7)
-    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
     search = LayoutSearch(problem(rig=LOUD, count=3, contacts=OF_PAIRS))
     candidates = search.problem.candidates
-    ends = np.array([LOUD.limits.frequency_min, LOUD.limits.frequency_max])
-    dense = {}
+    frequencies = search.problem.searched_frequencies
+    dense_scores = {}
     for triple in combinations(range(len(candidates)), 3):
         places = candidates[list(triple)]
         if search.problem.shortfall(places) == 0:
-            dense[triple] = dense_score(LOUD, places, PAIRS, ends)
+            dense_scores[triple] = DenseScore(LOUD, places).mean(PAIRS, frequencies)
             (scored,) = search.scored([places])
-            assert scored.score_db == pytest.approx(dense[triple], abs=0.05)
+            assert scored.score_db == pytest.approx(dense_scores[triple], abs=0.05), triple
+    assert len(dense_scores) >= 20
     rng = np.random.default_rng(0)
-    found = np.empty((0, 2))
+    positions = np.empty((0, 2))
     for _ in range(3):
-        found = search.add(found).positions
-    starts = [found, *(candidates[rng.choice(8, 3, replace=False)] for _ in range(8))]
-    ends = search.scored([search.exchange(each) for each in starts])
-    best = max(ends, key=lambda each: each.score_db)
-    assert len(dense) >= 20
-    numbers = np.flatnonzero((candidates[:, None] == best.positions).all(axis=-1).any(axis=1))
-    assert dense[tuple(numbers.tolist())] == pytest.approx(max(dense.values()), abs=0.05)
+        positions = search.add(positions).positions
+    starts = [positions]
+    for _ in range(8):
+        starts.append(candidates[rng.choice(8, 3, replace=False)])
+
+    results = search.scored([search.exchange(start) for start in starts])
+
+    best = max(results, key=lambda scored: scored.score_db)
+    matches = (candidates[:, None] == best.positions).all(axis=-1)
+    triple = tuple(np.flatnonzero(matches.any(axis=1)).tolist())
+    assert dense_scores[triple] == pytest.approx(max(dense_scores.values()), abs=0.05)
 
 
-def test_each_era_is_scored_with_its_own_foot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kept ERA on a point and new ones on discs of 6 cm, against a dense solve of them."""
-    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
+def test_each_era_is_scored_with_its_own_foot() -> None:
+    """A kept ERA on a point and new ones on discs of 6 cm."""
     first, *others = LOUD.eras
-    rig = replace(LOUD, eras=(first, *(replace(era, foot=0.06) for era in others)))
-    search = LayoutSearch(problem(rig=rig, count=3, kept=(first.name,), contacts=OF_PAIRS))
+    rig = replace(LOUD, eras=(first, *(replace(corner, foot=0.06) for corner in others)))
+    design_problem = problem(rig=rig, count=3, kept=(first.name,), contacts=OF_PAIRS)
     places = np.array([[first.x, first.y], [0.25, 0.05], [0.1, 0.2]])
+
+    score = score_of(design_problem, places)
+
     footprints = np.column_stack([places, [0.0, 0.06, 0.06]])
-    ends = np.array([rig.limits.frequency_min, rig.limits.frequency_max])
-    (scored,) = search.scored([places])
-    expected = dense_score(rig, footprints, PAIRS, ends)
-    assert scored.score_db == pytest.approx(expected, abs=0.05)
+    frequencies = design_problem.searched_frequencies
+    expected = DenseScore(rig, footprints).mean(PAIRS, frequencies)
+    assert score == pytest.approx(expected, abs=0.05)
 
 
-def problem(**changes) -> DesignProblem:
-    """Four ERAs along the edge of the paper's plate."""
-    some = changes.pop("rig", RIG)
-    usual = {
-        "count": 4, "kept": (), "area": area_of("edge", some.plate),
-        "contacts": replace(anywhere(some.plate), quiet=(1, 2)),
-        "apart": 0.03, "lowest": 20.0, "seed": 0,
-    }  # fmt: skip
-    return DesignProblem(rig=some, **(usual | changes))
+def test_scores_count_plates_of_other_thickness_exactly() -> None:
+    """4 % of thickness move resonances past a tone."""
+    rig = replace(LOUD, uncertainty=replace(GAINS, thickness=0.04))
+    design_problem = problem(rig=rig, contacts=OF_PAIRS)
+    places = design_problem.own_positions
+
+    score = score_of(design_problem, places)
+
+    frequencies = design_problem.searched_frequencies
+    expected = DenseScore(rig, places).mean(PAIRS, frequencies)
+    exact_thickness = DenseScore(LOUD, places).mean(PAIRS, frequencies)
+    assert score == pytest.approx(expected, abs=0.05)
+    assert expected < exact_thickness - 1
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_score_of_two_contents_is_that_of_the_worse(is_reversed: bool) -> None:
+    """Each with the other finger quiet."""
+    (pair,) = replace(anywhere(PLATE), quiet=(1, 1)).sets(1, seed=4)
+    if is_reversed:
+        pair = pair[::-1]
+    design_problem = problem(rig=LOUD, contacts=replace(anywhere(PLATE, 2), given=(pair,)))
+    places = design_problem.own_positions
+
+    score = score_of(design_problem, places)
+
+    dense = DenseScore(LOUD, places)
+    frequencies = design_problem.searched_frequencies
+    first = dense.mean([pair], frequencies)
+    second = dense.mean([pair[::-1]], frequencies)
+    assert abs(first - second) > 0.5
+    assert score == pytest.approx(min(first, second), abs=0.05)
+
+
+# Rules for ERAs
 
 
 def test_kept_eras_stay_and_all_keep_their_distance() -> None:
-    """A start at random, exchanged and moved, leaves what is kept and the least distance."""
+    """A random start is exchanged and moved, 8 cm apart along the edge."""
     search = LayoutSearch(problem(kept=("SW", "NE"), apart=0.08))
-    found = search.from_random(np.random.default_rng(2))
-    plate = RIG.plate
-    assert found.positions[:2].tolist() == [[0, 0], [plate.length, plate.width]]
-    gaps = np.linalg.norm(found.positions[:, None] - found.positions, axis=-1)
-    assert gaps[np.triu_indices(4, 1)].min() >= 0.08
-    assert area_of("edge", plate).contains(found.positions).all()
+
+    positions = search.from_random(np.random.default_rng(2)).positions
+
+    assert positions[:2].tolist() == [[0, 0], [PLATE.length, PLATE.width]]
+    assert gaps_between(positions).min() >= 0.08
+    is_at_edge = area_of("edge", PLATE).contains(positions)
+    np.testing.assert_array_equal(is_at_edge, True)
 
 
 def test_static_loads_of_a_seesaw() -> None:
-    """Three ERAs at two corners and the middle of the far side carry a quarter, a quarter, half."""
-    some, one = RIG, RIG.eras[0]
-    length, width = some.plate.length, some.plate.width
+    """Three ERAs at two corners and the middle of the far side carry a quarter, a quarter, half.
+
+    With the center of mass behind all of them, the plate tips.
+    """
+    corner = RIG.eras[0]
     eras = [
-        replace(one, name=str(number), x=x, y=y)
-        for number, (x, y) in enumerate([(0, 0), (length, 0), (length / 2, width)])
+        replace(corner, name="a", x=0.0, y=0.0),
+        replace(corner, name="b", x=PLATE.length, y=0.0),
+        replace(corner, name="c", x=PLATE.length / 2, y=PLATE.width),
     ]
-    weight = 9.80665 * some.plate.mass
-    assert static_loads(some.plate, eras) == pytest.approx([weight / 4, weight / 4, weight / 2])
-    assert shortfall(some, eras, lowest=10.0) == 0
-    # The center of mass behind all of them: the plate tips.
-    assert shortfall(some, [replace(era, y=0.2 * era.y) for era in eras], lowest=1.0) > 0
-    assert shortfall(some, eras, lowest=1e4) > 0
+    at_one_side = [*eras[:2], replace(eras[2], y=0.2 * PLATE.width)]
+
+    loads = static_loads(PLATE, eras)
+
+    weight = 9.80665 * PLATE.mass
+    assert loads == pytest.approx([weight / 4, weight / 4, weight / 2])
+    assert shortfall(RIG, eras, lowest=10.0) == 0
+    assert shortfall(RIG, at_one_side, lowest=1.0) > 0
+    assert shortfall(RIG, eras, lowest=1e4) > 0
 
 
 def test_area_without_room_is_refused() -> None:
-    """Too many ERAs too far apart, and no place at all, are named."""
-    with pytest.raises(InputError, match=r"room"):
+    """For ERAs too far apart, and without any position."""
+    nowhere = Area("none", PLATE.length, PLATE.width, lambda points: ~everywhere(points))
+
+    with pytest.raises(InputError, match="room"):
         problem(apart=0.3).random_layout(np.random.default_rng(0))
-    plate = RIG.plate
-    nowhere = Area("none", plate.length, plate.width, lambda points: ~everywhere(points))
     with pytest.raises(InputError, match=r"^where must"):
         candidates_of(nowhere, count=20)
 
 
-def test_era_without_foot_is_like_the_others() -> None:
-    """New ERAs are like the first that is not kept, with names that no kept one has."""
-    some = RIG
-    first = replace(some.eras[0], name="E1", stroke=5e-5)
-    case = problem(rig=replace(some, eras=(first, *some.eras[1:])), kept=("E1",))
-    eras: tuple[Era, ...] = case.eras(np.zeros((3, 2)))
-    assert [era.name for era in eras] == ["E1", "E2", "E3"]
-    assert [era.stroke for era in eras] == [5e-5, 1e-4, 1e-4]
+def test_new_eras_are_like_the_first_that_is_not_kept() -> None:
+    """With names that no kept ERA has."""
+    first = replace(RIG.eras[0], name="E1", stroke=5e-5)
+    rig = replace(RIG, eras=(first, *RIG.eras[1:]))
+
+    eras = problem(rig=rig, kept=("E1",)).eras(np.zeros((3, 2)))
+
+    strokes = {new.name: new.stroke for new in eras}
+    assert strokes == {"E1": 5e-5, "E2": 1e-4, "E3": 1e-4}
 
 
-def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
-    """As plates that are solved anew, dense: 4 % of thickness move resonances past a tone."""
-    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
-    thick = replace(LOUD, uncertainty=replace(GAINS, thickness=0.04))
-    some = problem(rig=thick, contacts=OF_PAIRS)
-    (found,) = LayoutSearch(some).scored([some.own_positions])
-    dense, certain = (
-        dense_score(each, some.own_positions, PAIRS, some.searched_frequencies)
-        for each in (thick, LOUD)
-    )
-    assert found.score_db == pytest.approx(dense, abs=0.05)
-    assert dense < certain - 1
-
-
-def test_the_score_of_two_contents_is_that_of_the_worse(monkeypatch) -> None:
-    """Each with the other finger quiet, by a dense solve of either."""
-    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
-    (pair,) = replace(anywhere(PLATE), quiet=(1, 1)).sets(1, seed=4)
-    for one, other in ((pair, pair[::-1]), (pair[::-1], pair)):
-        some = problem(rig=LOUD, contacts=replace(anywhere(PLATE, 2), given=(one,)))
-        (found,) = LayoutSearch(some).scored([some.own_positions])
-        each = [
-            dense_score(LOUD, some.own_positions, (way,), some.searched_frequencies)
-            for way in (one, other)
-        ]
-        assert abs(each[0] - each[1]) > 0.5
-        assert found.score_db == pytest.approx(min(each), abs=0.05)
-
-
-def test_layouts_on_a_small_raster_are_all_there_are(monkeypatch) -> None:
+def test_random_layouts_are_different(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four corners and nothing between them three can be chosen in four ways."""
     monkeypatch.setitem(problem_module.CANDIDATES, True, 4)
-    some = problem(count=3, apart=0.1)
-    count = len(some.candidates)
-    given = layouts_of("random:100", some)
-    random = [each for name, each in given.items() if name.startswith("3-")]
-    named = [each for each in given.values() if some.area.contains(each).all()]
-    choices = [some.candidates[list(each)] for each in combinations(range(count), 3)]
-    assert len(random) + sum(
-        any((np.sort(a, axis=0) == np.sort(b, axis=0)).all() for b in choices)
-        for a in named[: len(named) - len(random)]
-    ) == sum(map(some.are_apart, choices))
+    design_problem = problem(count=3, apart=0.1)
+
+    layouts = layouts_of("random:100", design_problem)
+
+    choices = set()
+    for triple in combinations(design_problem.candidates.tolist(), 3):
+        if design_problem.are_apart(np.array(triple)):
+            choices.add(frozenset(map(tuple, triple)))
+    random_layouts = []
+    for name, places in layouts.items():
+        if name.startswith("3-"):
+            random_layouts.append(frozenset(map(tuple, places.tolist())))
+    assert len(set(random_layouts)) == len(random_layouts) <= len(choices)
+    assert set(random_layouts) <= choices

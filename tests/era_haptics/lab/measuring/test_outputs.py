@@ -25,15 +25,16 @@ from model.rig.rig_file import load_rig
 from processes.sound_cards import DeskCard
 
 RATE = 8_000.0
-
 EXAMPLE = Path(__file__).parents[4] / "examples" / "desk" / "rig.yaml"
-SENSITIVITY = 0.01  # that the command does not know
+SENSITIVITY = 0.01  # not known to the command
+
+# By an accelerometer
 
 
-class Cabled(DeskCard):
-    """Outputs wired to ERAs in another order, each with a gain; negative: wires exchanged.
+class CabledCard(DeskCard):
+    """A card whose outputs are wired to ERAs in another order, each with a gain.
 
-    One input, of an accelerometer that is moved from place to place.
+    Negative gains are exchanged wires. Its input has an accelerometer that is moved.
     """
 
     order: Sequence[int]
@@ -41,11 +42,11 @@ class Cabled(DeskCard):
     place = -1
 
     def move(self, _name: str) -> None:
-        """To the next place."""
+        """Move the accelerometer to the next place."""
         self.place += 1
 
     def run(self, played: FloatArray) -> Float32Array:
-        """The loop-back's output is silent."""
+        """Advance the plate; the output of the loop-back is silent."""
         wired = np.zeros((len(played), 5))
         wired[:, self.order] = played * np.asarray(self.gains)
         return super().run(wired)[:, [self.place]]
@@ -56,119 +57,147 @@ def cabled(
     *,
     order: Sequence[int] = (0, 1, 2, 3),
     gains: Sequence[float] = (1, 1, 1, 1),
-    apart: float = 0.02,
-) -> Cabled:
-    """The deviating plate with a place as far [m] from each ERA, towards the middle."""
+    distance: float = 0.02,
+) -> CabledCard:
+    """Return a card in front of the true plate, with places near the ERAs.
+
+    distance: of each place from its ERA, towards the middle [m].
+    """
+    plate = truth.rig.plate
+    middle = np.array([plate.length / 2, plate.width / 2])
     sensors = []
-    for n, era in enumerate(truth.rig.eras, start=1):
-        way = np.array([truth.rig.plate.length / 2 - era.x, truth.rig.plate.width / 2 - era.y])
-        x, y = np.array([era.x, era.y]) + min(apart / np.linalg.norm(way), 1) * way
-        sensors.append(WiredSensor(f"A{n}", x, y, n, SENSITIVITY))
-    plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
-    card = Cabled(plate, rate=RATE)
-    card.order, card.gains = order, gains
+    for number, corner in enumerate(truth.rig.eras, start=1):
+        position = np.array([corner.x, corner.y])
+        inwards = middle - position
+        x, y = position + min(distance / np.linalg.norm(inwards), 1) * inwards
+        sensors.append(WiredSensor(f"A{number}", x, y, number, SENSITIVITY))
+    desk_plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
+    card = CabledCard(desk_plate, rate=RATE)
+    card.order = order
+    card.gains = gains
     return card
 
 
-def test_accelerometer_tells_swapped_backwards_dead_and_weak(rig: Rig, truth: Truth) -> None:
-    """Of a plate that deviates from the rig, with an unknown delay: as it was wired here.
+def findings(rig: Rig, card: CabledCard) -> list[OutputFinding]:
+    """Return what the accelerometer finds about each output."""
+    return listen_to_outputs(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
 
-    One plays nothing, another a quarter as loud: 12 dB, to the 3 dB that plates deviate by. An
-    accelerometer that stays in the middle has all four corners of a symmetric plate alike.
-    """
 
-    def heard(card: Cabled) -> list[OutputFinding]:
-        return listen_to_outputs(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
+def test_accelerometer_finds_swapped_and_backward_outputs(rig: Rig, truth: Truth) -> None:
+    """On a plate that differs from the rig, with an unknown delay."""
+    outputs = findings(rig, cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
 
-    found = heard(cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
-    assert [each.era for each in found] == [rig.eras[n].name for n in (0, 2, 1, 3)]
-    assert [each.polarity for each in found] == [1, 1, -1, 1]
-    assert [each.verdict == "ok" for each in found] == [True, True, False, True]
-    found = heard(cabled(truth, gains=(1, 0, 1, 0.25)))
-    assert [each.era for each in found] == ["SW", None, "NE", "NW"]
-    assert "dead" in found[1].verdict
-    assert "loose" in found[3].verdict
-    assert 20 * np.log10(found[3].relative_level) == pytest.approx(-12, abs=3)
+    assert [output.era for output in outputs] == ["SW", "NE", "SE", "NW"]
+    assert [output.polarity for output in outputs] == [1, 1, -1, 1]
+    assert [output.verdict == "ok" for output in outputs] == [True, True, False, True]
+
+
+def test_accelerometer_finds_dead_and_weak_outputs(rig: Rig, truth: Truth) -> None:
+    """An output plays nothing, another a quarter as loud: 12 dB, to the 3 dB of tolerances."""
+    outputs = findings(rig, cabled(truth, gains=(1, 0, 1, 0.25)))
+
+    assert [output.era for output in outputs] == ["SW", None, "NE", "NW"]
+    assert "dead" in outputs[1].verdict
+    assert "loose" in outputs[3].verdict
+    assert 20 * np.log10(outputs[3].relative_level) == pytest.approx(-12, abs=3)
+
+
+def test_accelerometer_must_be_moved(rig: Rig, truth: Truth) -> None:
+    """In the middle, all four corners of a symmetric plate are alike."""
     with pytest.raises(InputError, match="was moved each time"):
-        heard(cabled(truth, apart=1.0))
+        findings(rig, cabled(truth, distance=1.0))
 
 
-def test_exciters_are_told_apart_on_a_board_of_the_shop() -> None:
-    """12 boards that deviate: 10 % of E, 20 % of springs, 40 % of gains, 10 degrees, 25 mm."""
+def responses(rig: Rig, points: FloatArray, frequencies: FloatArray) -> ComplexArray:
+    """Return the response (eras, frequencies, points) of each exciter at each place."""
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
+    fields = free.acceleration(rig.eras, frequencies, points, loads=rig.masses)
+    return fields.transpose(1, 0, 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_exciters_are_matched_on_boards_with_tolerances(seed: int) -> None:
+    """Three boards: 10 % of E, 20 % of springs, 40 % of gains, 10 degrees, 25 mm."""
     nominal = exciter_rig()
     frequencies = np.arange(81.0, 261.0, 20.0)
-    points = np.array([[each.x, each.y] for each in nominal.eras])
-    rng = np.random.default_rng(0)
-    model = _responses(nominal, points, frequencies)
-    for _ in range(12):
-        board = nominal.plate.material
-        plate = replace(
-            nominal.plate, material=replace(board, E=board.E * (1 + 0.1 * rng.normal()))
-        )
-        eras = tuple(each.varied(stiffness=np.exp(0.2 * rng.normal())) for each in nominal.eras)
-        away = 0.025 * np.exp(2j * np.pi * rng.uniform(size=4))
-        real = replace(nominal, plate=plate, eras=eras)
-        values = _responses(real, points + np.stack([away.real, away.imag], axis=1), frequencies)
-        order, signs = rng.permutation(4), rng.permutation([1, 1, 1, -1])
-        gains = rng.uniform(0.6, 1.4, 4) * np.exp(1j * np.radians(10) * rng.normal(size=4))
-        late = np.exp(-2j * np.pi * frequencies * 0.0042)
-        played = values[order] * (signs * gains)[:, None, None] * late[:, None]
-        rows, found, polarities = matched(played, model, frequencies)
+    points = np.array([[exciter.x, exciter.y] for exciter in nominal.eras])
+    model = responses(nominal, points, frequencies)
+    delay = np.exp(-2j * np.pi * frequencies * 0.0042)
+    rng = np.random.default_rng(seed)
+    for _ in range(3):
+        material = nominal.plate.material
+        softer = replace(material, E=material.E * (1 + 0.1 * rng.normal()))
+        springs = np.exp(0.2 * rng.normal(size=4))
+        eras = []
+        for exciter, factor in zip(nominal.eras, springs, strict=True):
+            eras.append(exciter.varied(stiffness=factor))
+        board = replace(nominal, plate=replace(nominal.plate, material=softer), eras=tuple(eras))
+        angles = rng.uniform(0, 2 * np.pi, 4)
+        offsets = 0.025 * np.column_stack([np.cos(angles), np.sin(angles)])
+        order = rng.permutation(4)
+        signs = rng.permutation([1, 1, 1, -1])
+        phases = np.exp(1j * np.radians(10) * rng.normal(size=4))
+        gains = signs * rng.uniform(0.6, 1.4, 4) * phases
+        played = responses(board, points + offsets, frequencies)[order]
+        played = played * gains[:, None, None] * delay[:, None]
+
+        rows, eras_of_outputs, polarities = matched(played, model, frequencies)
+
         assert rows.tolist() == [0, 1, 2, 3]
-        assert found.tolist() == order.tolist()
+        assert eras_of_outputs.tolist() == order.tolist()
         assert polarities.tolist() == signs.tolist()
 
 
-def _responses(rig: Rig, points: FloatArray, frequencies: FloatArray) -> ComplexArray:
-    """Of each exciter, each frequency, at each place."""
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
-    return free.acceleration(rig.eras, frequencies, points, loads=rig.masses).transpose(1, 0, 2)
+# By a person
 
 
 def test_tone_is_soft_on_one_output_within_the_limits(rig: Rig) -> None:
     """Largest sample and steepest rise by hand, others silent; a forbidden frequency is refused."""
     desk = Desk(rig, ())
-    played = tone(desk, 3, outputs=4, rate=48_000, level=0.1, frequency=160.0)
-    assert np.abs(played).max() == pytest.approx(0.1, rel=1e-3)
-    assert not played[:, [0, 1, 3]].any()
-    assert np.abs(np.diff(played, axis=0)).max() < 0.1 * 2 * np.pi * 160 / 48_000 * 1.01
-    assert played[0, 2] == 0
+
+    samples = tone(desk, 3, outputs=4, rate=48_000, level=0.1, frequency=160.0)
+
+    assert np.abs(samples).max() == pytest.approx(0.1, rel=1e-3)
+    np.testing.assert_array_equal(samples[:, [0, 1, 3]], 0)
+    steepest = np.abs(np.diff(samples, axis=0)).max()
+    assert steepest < 0.1 * 2 * np.pi * 160 / 48_000 * 1.01
+    assert samples[0, 2] == 0
     with pytest.raises(InputError, match="--frequency"):
         tone(desk, 1, outputs=4, rate=48_000, level=0.1, frequency=5.0)
 
 
 @pytest.mark.parametrize(
-    ("said", "channels", "status"),
+    ("typed", "channels", "missing", "status"),
     [
-        ("SE\nr\nsw\nxx\nNE\nNW\n", {"SE": 0, "SW": 1, "NE": 2, "NW": 3}, 0),
-        ("SW\nSE\n-\nNW\n", {"SW": 0, "SE": 1, "NW": 3}, 1),
+        ("SE\nr\nsw\nxx\nNE\nNW\n", {"SE": 0, "SW": 1, "NE": 2, "NW": 3}, [], 0),
+        ("SW\nSE\n-\nNW\n", {"SW": 0, "SE": 1, "NW": 3}, ["NE"], 1),
     ],
+    ids=["repeated and unknown", "no output"],
 )
-def test_said_channels_are_written(
+def test_typed_channels_are_written(
     truth: Truth,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    said: str,
+    typed: str,
     channels: dict[str, int],
+    missing: list[str],
     status: int,
 ) -> None:
-    """As they were said, one asked again; with one that no output drives no file is written."""
+    """If all ERAs have an output; `r` repeats a tone."""
     card = cabled(truth)
     monkeypatch.setattr("era_haptics.lab.measuring.outputs.open_card", lambda *_, **__: card)
     rig_file, output = tmp_path / "rig.yaml", tmp_path / "wired.yaml"
     shutil.copy(EXAMPLE, rig_file)
-    done = CliRunner().invoke(
-        cli_app,
-        ["outputs", str(rig_file), "--device", "jack", "-o", str(output), "--json"],
-        input=said,
-    )
-    assert done.exit_code == status
-    answer = json.loads(done.stdout.splitlines()[-1])  # what is typed is echoed before
-    assert answer["channels"] == channels
-    assert output.exists() == (status == 0)
-    if status == 0:
+    command = ["outputs", str(rig_file), "--device", "jack", "-o", str(output), "--json"]
+
+    result = CliRunner().invoke(cli_app, command, input=typed)
+
+    assert result.exit_code == status
+    report = json.loads(result.stdout.splitlines()[-1])  # typed lines are echoed before
+    assert report["channels"] == channels
+    assert report.get("missing", []) == missing
+    assert output.exists() == (not missing)
+    if not missing:
         wiring = load_rig(output).wiring
-        assert {name: wired.number for name, wired in wiring.items()} == channels
+        assert {name: channel.number for name, channel in wiring.items()} == channels
         assert "base: rig.yaml" in output.read_text("utf-8")
-    else:
-        assert answer["missing"] == ["NE"]

@@ -1,7 +1,7 @@
 """Shaped onsets and endings, their knots and predictions, against ramps and a stepping solver."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,122 +16,140 @@ from kit.plates import (
     shaped_base,
     stepped_acceleration,
 )
-from model.arrays import lattice
+from model.arrays import ComplexArray, FloatArray, Point, lattice
 from model.errors import InputError
 from model.finger import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
+from model.rig.rig import Rig
 from model.structure.material import material
 from model.structure.plate import Plate
 from model.structure.sources import Era
 from model.transients.base_motion import (
     BaseEnvelope,
     Envelopes,
-    Motion,
-    raised_cosine,
     ramped_ending,
     ramped_onset,
     shaped,
 )
-from model.transients.knots import (
-    ONSET_KNOTS,
-    bounded_minimum,
-    hat_accelerations,
-    steady_states,
-)
+from model.transients.knots import ONSET_KNOTS, bounded_minimum, hat_accelerations, steady_states
 from model.transients.shaping import SAMPLE_RATE, Shaper, Transients
-from model.transients.time_response import plate_in_time
+from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, Tone
 
-VARIANCE = 0.05**2 + np.radians(5) ** 2
-FREQUENCIES = [40.0, 75.4, 110.8, 217.0, 500.0]
+GAIN_VARIANCE = 0.05**2 + np.radians(5) ** 2
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The paper's rig, its plate in time, and what shapes and predicts onsets on it."""
+
+    rig: Rig
+    plate: PlateInTime
+    shaper: Shaper
+    transients: Transients
+
+    def tones(self, frequency: float, weights: ComplexArray) -> Excitation:
+        """Tones of a frequency from weights in strokes."""
+        excitation = {}
+        for era, weight in zip(self.rig.eras, weights, strict=True):
+            excitation[era.name] = Tone.from_phasor(frequency, complex(era.stroke * weight))
+        return excitation
+
+    def random_tones(self, frequency: float, seed: int) -> Excitation:
+        """Every ERA at a random phase, the strongest at full stroke."""
+        rng = np.random.default_rng(seed)
+        weights = rng.standard_normal((len(self.rig.eras), 2)) @ [1, 1j]
+        return self.tones(frequency, weights / np.abs(weights).max())
+
+    def steady_at(self, frequency: float, finger: Point) -> ComplexArray:
+        """Steady accelerations (4, n) at a fingertip by each ERA at full stroke."""
+        omega = 2 * np.pi * frequency
+        coordinates = steady_states(self.plate, omega) @ self.plate.displacement.T
+        points = fingertip_points(*finger, self.rig.plate)
+        return np.asarray(-(omega**2) * coordinates @ self.plate.reduced.at(points).T)
+
+    def loaded_weights(self, frequency: float, target: Point, quiet: Point) -> ComplexArray:
+        """R w = conj(h) with errors of 0.1, the largest weight 1."""
+        target_mean = self.steady_at(frequency, target).mean(axis=1)
+        quiet_fields = self.steady_at(frequency, quiet)
+        covariance = quiet_fields.conj() @ quiet_fields.T / quiet_fields.shape[1]
+        covariance += 0.01 * np.diag(np.diag(covariance))
+        weights = np.linalg.solve(covariance, target_mean.conj())
+        return np.asarray(weights / np.abs(weights).max())
+
+    def steady_contrast_db(
+        self, weights: ComplexArray, frequency: float, target: Point, quiet: Point
+    ) -> float:
+        """Mean at the target over the largest value at the quiet finger."""
+        target_sizes = np.abs(weights @ self.steady_at(frequency, target))
+        quiet_sizes = np.abs(weights @ self.steady_at(frequency, quiet))
+        target_mean = target_sizes @ fingertip_weights(*target, self.rig.plate)
+        return float(20 * np.log10(target_mean / quiet_sizes.max()))
 
 
 @pytest.fixture(scope="module")
-def setup():
-    """Rig, plate in time, and one shaper and predictor for all tests."""
+def setup() -> Setup:
+    """One shaper and predictor for all tests."""
     rig, plate = make_plate_in_time()
-    return rig, plate, Shaper(plate, gain_variance=VARIANCE), Transients(plate)
+    return Setup(rig, plate, Shaper(plate, gain_variance=GAIN_VARIANCE), Transients(plate))
 
 
-def random_excitation(rig, frequency, rng) -> Excitation:
-    """Every ERA at random phase, the strongest at full stroke."""
-    weights = rng.standard_normal(len(rig.eras)) + 1j * rng.standard_normal(len(rig.eras))
-    return tones(rig, frequency, weights / np.abs(weights).max())
-
-
-def tones(rig, frequency, weights) -> Excitation:
-    """An excitation from weights in strokes."""
-    return {
-        era.name: Tone(frequency, float(era.stroke * abs(w)), float(np.angle(w)))
-        for era, w in zip(rig.eras, weights, strict=True)
-    }
-
-
-def loaded_weights(plate, frequency, target, quiet):
-    """R w = conj(h) with errors of 0.1, from steady accelerations at both fingertips."""
-    omega = 2 * np.pi * frequency
-    steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
-    h, q = (
-        steady @ plate.reduced.at(fingertip_points(*each, plate.reduced.plate)).T
-        for each in (target, quiet)
-    )
-    power = (np.abs(q) ** 2).mean(axis=1)
-    w = np.linalg.solve(q.conj() @ q.T / q.shape[1] + np.diag(0.01 * power), h.mean(axis=1).conj())
-    return w / np.abs(w).max()
-
-
-def era_errors(rng):
-    """Complex factors (4,) of ERAs with errors of 5 % in gain and 5 degrees in phase."""
+def era_errors(seed: int, rig: Rig) -> dict[str, complex]:
+    """A complex factor per ERA, with errors of 5 % in gain and 5 degrees in phase."""
+    rng = np.random.default_rng(seed)
     gains = 1 + 0.05 * rng.standard_normal(4)
-    return gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
+    factors = gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
+    names = sorted(era.name for era in rig.eras)
+    return dict(zip(names, factors.tolist(), strict=True))
 
 
-def wrong_tones(excitation: Excitation, errors) -> Excitation:
-    """The tones of ERAs with errors, in the order of the names."""
+def tones_with(errors: dict[str, complex], excitation: Excitation) -> Excitation:
+    """The tones that ERAs with errors play."""
     return {
-        name: Tone(tone.frequency, tone.amplitude * abs(e), tone.phase + np.angle(e))
-        for (name, tone), e in zip(sorted(excitation.items()), errors, strict=True)
+        name: Tone.from_phasor(tone.frequency, tone.phasor * errors[name])
+        for name, tone in excitation.items()
     }
 
 
-def wrong(envelopes: Envelopes, errors) -> Envelopes:
-    """The envelopes of ERAs with errors, in the order of the names."""
-    return {
-        name: replace(
-            envelopes[name],
-            start=complex(envelopes[name].start * error),
-            knots=tuple(complex(knot * error) for knot in envelopes[name].knots),
-        )
-        for name, error in zip(sorted(envelopes), errors, strict=True)
-    }
+def envelopes_with(errors: dict[str, complex], envelopes: Envelopes) -> Envelopes:
+    """The envelopes that ERAs with errors play."""
+    changed = {}
+    for name, envelope in envelopes.items():
+        error = errors[name]
+        knots = tuple(knot * error for knot in envelope.knots)
+        changed[name] = replace(envelope, start=envelope.start * error, knots=knots)
+    return changed
 
 
-@pytest.mark.parametrize("frequency", FREQUENCIES)
-def test_shaped_envelopes_stay_within_the_stroke_and_stop_the_plate(setup, frequency):
-    """At full stroke, resonance or not, they join the pattern.
+# Shaped onsets and endings
 
-    After an ending of 40 ms at least 6 dB less is left than after a ramp as long, or a stop.
+
+@pytest.mark.parametrize("frequency", [40.0, 110.8, 500.0])
+def test_shaped_envelopes_stay_within_the_stroke_and_stop_the_plate(
+    setup: Setup, frequency: float
+) -> None:
+    """At full stroke, resonance or not, onset and ending join the steady pattern.
+
+    An ending of 40 ms leaves at least 6 dB less than a ramp as long, or than an abrupt stop.
     """
-    rig, _, shaper, transients = setup
-    excitation = random_excitation(rig, frequency, np.random.default_rng(int(frequency)))
-    onsets = shaper.onset(excitation, targets=[(0.08, 0.06)], quiet=[(0.2, 0.17)])
-    endings = shaper.ending(excitation)
-    for era in rig.eras:
-        onset, ending, amplitude = (
-            onsets[era.name],
-            endings[era.name],
-            excitation[era.name].phasor,
-        )
+    excitation = setup.random_tones(frequency, seed=int(frequency))
+    onsets = setup.shaper.onset(excitation, targets=[(0.08, 0.06)], quiet=[(0.2, 0.17)])
+    endings = setup.shaper.ending(excitation)
+    eras = setup.rig.eras
+
+    for era in eras:
+        onset, ending = onsets[era.name], endings[era.name]
+        amplitude = excitation[era.name].phasor
         assert max(onset.largest, ending.largest) <= era.stroke * (1 + 1e-9)
         assert onset.start == ending.knots[-1] == 0
         assert onset.knots[-1] == pytest.approx(amplitude)
         assert ending.start == pytest.approx(amplitude)
         assert len(onset.knots) == ONSET_KNOTS == 21
         assert ending.duration == pytest.approx(0.040)
-    left = transients.residual_db(excitation, shaped(endings, rig.eras))
+    residual = setup.transients.residual_db(excitation, shaped(endings, eras))
     for ramp in (0.0, 0.04):
-        plain = ramped_ending(excitation, rig.eras, ramp=ramp)
-        assert left < transients.residual_db(excitation, plain) - 6
+        plain_ending = ramped_ending(excitation, eras, ramp=ramp)
+        assert residual < setup.transients.residual_db(excitation, plain_ending) - 6
 
 
 PAIRS = [
@@ -140,252 +158,280 @@ PAIRS = [
     ((0.02, 0.12), (0.14, 0.2), 199.2),
     ((0.19, 0.16), (0.04, 0.12), 464.6),
 ]
+"""Target, quiet finger and frequency."""
 
 
 @pytest.mark.parametrize(("target", "quiet", "frequency"), PAIRS)
-def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, frequency):
-    """In the first 100 ms and with errors: 6 dB more than a 20 ms ramp, 6 dB off steady at most."""
-    rig, plate, shaper, transients = setup
-    weights = loaded_weights(plate, frequency, target, quiet)
-    excitation = tones(rig, frequency, weights)
-    onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
+def test_shaped_onset_keeps_most_of_the_steady_contrast(
+    setup: Setup, target: Point, quiet: Point, frequency: float
+) -> None:
+    """In the first 100 ms and with errors: 6 dB above a 20 ms ramp, at most 6 dB below steady."""
+    eras = setup.rig.eras
+    weights = setup.loaded_weights(frequency, target, quiet)
+    excitation = setup.tones(frequency, weights)
+    onset = setup.shaper.onset(excitation, targets=[target], quiet=[quiet])
+    fingers = {"targets": [target], "quiet": [quiet]}
+    onset_contrasts, steady_contrasts = [], []
 
-    def contrast(bases):
-        return transients.contrast_db(bases, targets=[target], quiet=[quiet])
-
-    def steady_contrast(weights):
-        omega = 2 * np.pi * frequency
-        steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
-        at = [
-            np.abs(weights @ steady @ plate.reduced.at(fingertip_points(*each, rig.plate)).T)
-            for each in (target, quiet)
-        ]
-        return 20 * np.log10(at[0] @ fingertip_weights(*target, rig.plate) / at[1].max())
-
-    realised, steady = [], []
-    names = sorted(excitation)
-    order = [names.index(era.name) for era in rig.eras]
     for seed in range(12):
-        errors = era_errors(np.random.default_rng(seed))
-        realised.append(contrast(shaped(wrong(onset, errors), rig.eras)))
-        steady.append(steady_contrast(weights * errors[order]))
-    ramp = contrast(ramped_onset(excitation, rig.eras, ramp=0.02))
-    assert np.median(realised) > ramp + 6
-    assert np.median(realised) > np.median(steady) - 6
+        errors = era_errors(seed, setup.rig)
+        bases = shaped(envelopes_with(errors, onset), eras)
+        onset_contrasts.append(setup.transients.contrast_db(bases, **fingers))
+        factors = np.array([errors[era.name] for era in eras])
+        contrast = setup.steady_contrast_db(weights * factors, frequency, target, quiet)
+        steady_contrasts.append(contrast)
+
+    ramp = ramped_onset(excitation, eras, ramp=0.02)
+    ramp_contrast = setup.transients.contrast_db(ramp, **fingers)
+    assert np.median(onset_contrasts) > ramp_contrast + 6
+    assert np.median(onset_contrasts) > np.median(steady_contrasts) - 6
 
 
-def test_shaping_includes_the_errors_of_the_eras(setup):
-    """With errors the robust onset and ending do better than those that know of no errors."""
-    rig, plate, shaper, transients = setup
+def test_shaping_accounts_for_errors_of_the_eras(setup: Setup) -> None:
+    """On ERAs with errors, robust onsets and endings are better than those for exact ERAs."""
     target, quiet, frequency = PAIRS[2]
-    excitation = tones(rig, frequency, loaded_weights(plate, frequency, target, quiet))
-    low = random_excitation(rig, 110.8, np.random.default_rng(1))
-    found = [(shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low))]
-    shaper = Shaper(plate, gain_variance=0.0)
-    found.append((shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low)))
-    contrast, left = [], []
-    for onset, ending in found:
+    eras = setup.rig.eras
+    fingers = {"targets": [target], "quiet": [quiet]}
+    excitation = setup.tones(frequency, setup.loaded_weights(frequency, target, quiet))
+    low_excitation = setup.random_tones(110.8, seed=1)
+
+    def medians(shaper: Shaper) -> tuple[float, float]:
+        onset = shaper.onset(excitation, **fingers)
+        ending = shaper.ending(low_excitation)
+        contrasts, residuals = [], []
         for seed in range(40):
-            errors = era_errors(np.random.default_rng(seed))
-            bases = shaped(wrong(onset, errors), rig.eras)
-            contrast.append(transients.contrast_db(bases, targets=[target], quiet=[quiet]))
-            off = wrong_tones(low, errors)
-            left.append(transients.residual_db(off, shaped(wrong(ending, errors), rig.eras)))
-    assert np.median(contrast[:40]) > np.median(contrast[40:]) + 0.2
-    assert np.median(left[:40]) < np.median(left[40:]) - 1
+            errors = era_errors(seed, setup.rig)
+            bases = shaped(envelopes_with(errors, onset), eras)
+            contrasts.append(setup.transients.contrast_db(bases, **fingers))
+            stopped = shaped(envelopes_with(errors, ending), eras)
+            tones = tones_with(errors, low_excitation)
+            residuals.append(setup.transients.residual_db(tones, stopped))
+        return float(np.median(contrasts)), float(np.median(residuals))
+
+    robust_contrast, robust_residual = medians(setup.shaper)
+    exact_contrast, exact_residual = medians(Shaper(setup.plate, gain_variance=0.0))
+
+    assert robust_contrast > exact_contrast + 0.2
+    assert robust_residual < exact_residual - 1
 
 
-def test_a_shaped_target_follows_its_ramp_and_its_quiet_finger_stays_quiet(setup):
-    """A target has nothing at first, half its amplitude within 35 ms, and most of it by 60 ms.
+@pytest.mark.parametrize(("target", "quiet", "frequency"), PAIRS)
+def test_shaped_ending_is_weaker_at_quiet_fingers(
+    setup: Setup, target: Point, quiet: Point, frequency: float
+) -> None:
+    """Peaks at a quiet finger are lower than without knowing it, above 150 Hz than in a ramp.
 
-    Peaks of an ending at a quiet finger are lower than if it did not know it, above 150 Hz lower
-    than in a ramp. In a few periods of a low frequency a plate is not stopped that quietly, but it
-    is stopped.
+    A few periods of a low frequency do not stop a plate that quietly, but they stop it.
     """
-    rig, plate, shaper, transients = setup
-    for target, quiet, frequency in PAIRS:
-        at = {"targets": [target], "quiet": [quiet]}
-        weights = loaded_weights(plate, frequency, target, quiet)
-        excitation = tones(rig, frequency, 0.1 * weights)
-        knowing = shaped(shaper.ending(excitation, **at), rig.eras)
-        known, unknown, ramp = (
-            np.abs(
-                transients.acceleration(
-                    bases, fingertip_points(*quiet, rig.plate), duration=0.1, after=excitation
-                )
-            ).max()
-            for bases in (
-                knowing,
-                shaped(shaper.ending(excitation), rig.eras),
-                ramped_ending(excitation, rig.eras, ramp=0.02),
-            )
-        )
-        is_low = frequency < 150
-        assert known < 0.7 * unknown
-        assert is_low or known < 0.7 * ramp
-        assert transients.residual_db(excitation, knowing) < (-30 if is_low else -40)
-        if frequency > 100:
-            onset = shaped(shaper.onset(excitation, **at), rig.eras)
-            felt = np.abs(transients.acceleration(onset, np.array([target]), duration=0.3)[:, 0])
-            steady = felt[-800:].max()
-            assert felt[:24].max() < 0.1 * steady  # 3 ms
-            assert felt[:280].max() > 0.5 * steady
-            assert felt[280:480].max() > 0.65 * steady
+    rig, transients = setup.rig, setup.transients
+    weights = 0.1 * setup.loaded_weights(frequency, target, quiet)
+    excitation = setup.tones(frequency, weights)
+    points = fingertip_points(*quiet, rig.plate)
+
+    def peak(bases) -> float:
+        felt = transients.acceleration(bases, points, duration=0.1, after=excitation)
+        return float(np.abs(felt).max())
+
+    ending = setup.shaper.ending(excitation, targets=[target], quiet=[quiet])
+    bases = shaped(ending, rig.eras)
+    general_bases = shaped(setup.shaper.ending(excitation), rig.eras)
+    residual = transients.residual_db(excitation, bases)
+
+    assert peak(bases) < 0.7 * peak(general_bases)
+    if frequency < 150:
+        assert residual < -30
+    else:
+        assert peak(bases) < 0.7 * peak(ramped_ending(excitation, rig.eras, ramp=0.02))
+        assert residual < -40
 
 
-def test_envelopes_keep_the_frequency_of_each_era(setup):
-    """With two frequencies each ERA keeps its own, and one that is silent stays silent.
+@pytest.mark.parametrize(("target", "quiet", "frequency"), PAIRS[1:])
+def test_shaped_onset_follows_its_ramp_at_the_target(
+    setup: Setup, target: Point, quiet: Point, frequency: float
+) -> None:
+    """Nothing within 3 ms, half the amplitude within 35 ms, and most of it by 60 ms."""
+    weights = 0.1 * setup.loaded_weights(frequency, target, quiet)
+    excitation = setup.tones(frequency, weights)
+    onset = setup.shaper.onset(excitation, targets=[target], quiet=[quiet])
 
-    Of one frequency it plays during the onset, and is silent again at its end and during the
-    ending.
-    """
-    rig, _, shaper, transients = setup
-    at = {"targets": [(0.05, 0.05)], "quiet": [(0.2, 0.15)]}
-    two = {"SW": Tone(110.8, 8e-5), "NE": Tone(217.0, 6e-5, 1.0)}
-    onset, ending = shaper.onset(two, **at), shaper.ending(two)
-    assert {name: each.frequency for name, each in onset.items()} == {"SW": 110.8, "NE": 217.0}
+    bases = shaped(onset, setup.rig.eras)
+    felt = setup.transients.acceleration(bases, np.array([target]), duration=0.3)[:, 0]
+
+    sizes = np.abs(felt)
+    steady = sizes[-800:].max()
+    assert sizes[:24].max() < 0.1 * steady  # 24 samples are 3 ms
+    assert sizes[:280].max() > 0.5 * steady
+    assert sizes[280:480].max() > 0.65 * steady
+
+
+def test_envelopes_keep_the_frequency_of_each_era(setup: Setup) -> None:
+    """With two frequencies each ERA keeps its own, and silent ERAs stay silent."""
+    excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(217.0, 6e-5, 1.0)}
+    eras = setup.rig.eras
+
+    onset = setup.shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
+    ending = setup.shaper.ending(excitation)
+
+    frequencies = {name: envelope.frequency for name, envelope in onset.items()}
+    assert frequencies == {"SW": 110.8, "NE": 217.0}
     assert onset["NE"].knots[-1] == pytest.approx(6e-5 * np.exp(1j))
-    stopped = transients.residual_db(two, ramped_ending(two, rig.eras, ramp=0.0))
-    assert transients.residual_db(two, shaped(ending, rig.eras)) < stopped - 3
+    abrupt_ending = ramped_ending(excitation, eras, ramp=0.0)
+    residual = setup.transients.residual_db(excitation, shaped(ending, eras))
+    assert residual < setup.transients.residual_db(excitation, abrupt_ending) - 3
 
-    one = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
-    onset = shaper.onset(one, **at)
-    assert set(onset) == {era.name for era in rig.eras}
+
+def test_silent_era_helps_only_during_an_onset(setup: Setup) -> None:
+    """With a single frequency a silent ERA plays during the onset and is silent afterwards."""
+    excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
+
+    onset = setup.shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
+    ending = setup.shaper.ending(excitation)
+
+    assert set(onset) == {era.name for era in setup.rig.eras}
     assert onset["SE"].knots[-1] == 0
     assert onset["SE"].largest > 1e-7
-    assert set(shaper.ending(one)) == set(one)
+    assert set(ending) == set(excitation)
 
 
-def test_onset_of_a_lone_finger_keeps_the_surroundings_quiet(setup):
-    """Without quiet fingers the rest of the plate moves less during the onset than with a ramp.
+def test_onset_of_a_lone_finger_keeps_its_surroundings_quiet(setup: Setup) -> None:
+    """The plate around moves less, compared with the target, than in a ramp.
 
-    Or than with a quiet finger nearby. Relative to the target's peak, as contrast is.
+    And less than with a quiet finger, which draws attention to one place.
     """
-    rig, _, shaper, transients = setup
-    target = (0.05, 0.18)
-    excitation = random_excitation(rig, 217.0, np.random.default_rng(5))
-    rest = lattice(np.linspace(0.12, 0.3, 8), np.linspace(0.01, 0.12, 6))
-    share = []
-    for bases in (
-        shaped(shaper.onset(excitation, targets=[target]), rig.eras),
-        ramped_onset(excitation, rig.eras, ramp=0.02),
-        shaped(shaper.onset(excitation, targets=[target], quiet=[(0.05, 0.05)]), rig.eras),
-    ):
-        felt = transients.acceleration(bases, np.vstack([[target], rest]))
-        share.append(np.sqrt((felt[:, 1:] ** 2).mean()) / np.abs(felt[:, 0]).max())
-    assert share[0] < 0.9 * min(share[1:])
+    eras, target = setup.rig.eras, (0.05, 0.18)
+    excitation = setup.random_tones(217.0, seed=5)
+    surroundings = lattice(np.linspace(0.12, 0.3, 8), np.linspace(0.01, 0.12, 6))
+    points = np.vstack([[target], surroundings])
 
+    def share_around(bases) -> float:
+        felt = setup.transients.acceleration(bases, points)
+        target_peak = np.abs(felt[:, 0]).max()
+        return float(np.sqrt((felt[:, 1:] ** 2).mean()) / target_peak)
+
+    lone_onset = setup.shaper.onset(excitation, targets=[target])
+    pair_onset = setup.shaper.onset(excitation, targets=[target], quiet=[(0.05, 0.05)])
+    lone_share = share_around(shaped(lone_onset, eras))
+
+    assert lone_share < 0.9 * share_around(ramped_onset(excitation, eras, ramp=0.02))
+    assert lone_share < 0.9 * share_around(shaped(pair_onset, eras))
+
+
+# Responses in time
 
 STEP = 0.005
 
 
 @pytest.fixture(scope="module")
-def few_modes():
+def few_modes() -> tuple[Rig, PlateInTime]:
     """Rig and plate with modes for 100 Hz only, so that a stepping solver is quick."""
     return make_plate_in_time(frequency_max=100.0)
 
 
-def test_hat_response_equals_time_stepping(few_modes):
+def test_hat_response_equals_time_stepping(few_modes: tuple[Rig, PlateInTime]) -> None:
     """Closed form, back on its carrier, follows Runge-Kutta through rise, fall and ringing."""
     rig, plate = few_modes
     omega, samples = 2 * math.pi * 90.0, 4
+    hat = shaped_base(rig.eras[1].stroke, 90.0, start=0.0, step=STEP, knots=(0, 1, 0))
+    bases = [STILL.motion, hat.motion, STILL.motion, STILL.motion]
+    breaks = STEP * np.array([0, 1, 2, 6])
+
     hats = hat_accelerations(plate, omega, step=STEP, steps=6, samples=samples)
     times = STEP * (np.arange(len(hats)) + 0.5) / samples
-    hat = shaped_base(rig.eras[1].stroke, 90.0, start=0.0, step=STEP, knots=(0, 1, 0))
-    breaks = np.array([0, STEP, 2 * STEP, 6 * STEP])
-    bases = [each.motion for each in (STILL, hat, STILL, STILL)]
-    stepped = stepped_acceleration(plate, bases, times, breaks=breaks)
-    found = (hats[:, 1] * np.exp(1j * omega * times)[:, None]).imag
-    np.testing.assert_allclose(found, stepped, atol=1e-5 * np.abs(stepped).max())
+    carrier = np.exp(1j * omega * times)
+    response = (hats[:, 1] * carrier[:, None]).imag
+
+    expected = stepped_acceleration(plate, bases, times, breaks=breaks)
+    np.testing.assert_allclose(response, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_acceleration_equals_time_stepping(few_modes):
+def test_acceleration_equals_time_stepping(few_modes: tuple[Rig, PlateInTime]) -> None:
     """A ramped tone and an envelope at another frequency together follow Runge-Kutta."""
     rig, plate = few_modes
     knots = (3e-5 + 2e-5j, -1e-5j, 5e-5 + 0j)
-    ramp = ramped_onset({"SW": Tone(70.0, 8e-5, 0.4)}, rig.eras, ramp=0.01)
-    bases = (ramp[0], (), BaseEnvelope(120.0, 0j, knots).terms(), ())
+    ramp, *_ = ramped_onset({"SW": Tone(70.0, 8e-5, 0.4)}, rig.eras, ramp=0.01)
     tone = faded_base(8e-5, 70.0, 0.4, rise=(0.0, 0.01), fall=(1.0, 2.0))
-    on = 4 * knots[-1:]  # the last knot stays
-    envelope = shaped_base(1.0, 120.0, start=0.0, step=STEP, knots=(0, *knots, *on))
-    points = fingertip_points(0.07, 0.16, rig.plate)
-    found = Transients(plate).acceleration(bases, points, duration=0.03)
-    times = np.arange(len(found)) / SAMPLE_RATE
+    lasting_knots = (0, *knots, *4 * knots[-1:])
+    envelope = shaped_base(1.0, 120.0, start=0.0, step=STEP, knots=lasting_knots)
+    motions = [tone.motion, STILL.motion, envelope.motion, STILL.motion]
     breaks = np.array([0, 0.005, 0.01, 0.015, 0.03])
-    motions = [each.motion for each in (tone, STILL, envelope, STILL)]
-    stepped = stepped_acceleration(plate, motions, times, breaks=breaks)
-    expected = stepped @ plate.reduced.at(points).T
-    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    points = fingertip_points(0.07, 0.16, rig.plate)
+
+    bases = (ramp, (), BaseEnvelope(120.0, 0j, knots).terms(), ())
+    response = Transients(plate).acceleration(bases, points, duration=0.03)
+
+    times = np.arange(len(response)) / SAMPLE_RATE
+    coordinates = stepped_acceleration(plate, motions, times, breaks=breaks)
+    expected = coordinates @ plate.reduced.at(points).T
+    np.testing.assert_allclose(response, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_ramped_onset_and_ending_are_raised_cosines():
-    """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
-    rig = make_paper_rig(2, 2)
+def test_ramped_onset_and_ending_are_raised_cosines() -> None:
+    """Half way through a ramp the amplitude is half; it is zero or full at the ends."""
+    eras = make_paper_rig(2, 2).eras
     excitation = {"SE": Tone(50.0, 1e-4, 0.3)}
-    up, down = (each(excitation, rig.eras, ramp=0.02) for each in (ramped_onset, ramped_ending))
-    assert [len(base) > 0 for base in up] == [era.name == "SE" for era in rig.eras]
     times, shares = np.array([0.0, 0.01, 0.03]), np.array([0.0, 0.5, 1.0])
     tone = 1e-4 * np.sin(2 * math.pi * 50.0 * times + 0.3)
-    assert motion_of(up[1], times) == pytest.approx(shares * tone, abs=1e-17)
-    assert motion_of(down[1], times) == pytest.approx((1 - shares) * tone, abs=1e-17)
+
+    onset = ramped_onset(excitation, eras, ramp=0.02)
+    ending = ramped_ending(excitation, eras, ramp=0.02)
+
+    moving = [era.name for era, base in zip(eras, onset, strict=True) if base]
+    assert moving == ["SE"]
+    assert motion_of(onset[1], times) == pytest.approx(shares * tone, abs=1e-17)
+    assert motion_of(ending[1], times) == pytest.approx((1 - shares) * tone, abs=1e-17)
 
 
-def random_form(seed: int, n: int):
-    """A (n, n) Hermitian positive definite and b (n,) for which bounds of 1 matter."""
+@pytest.mark.parametrize("seed", [0, 1])
+def test_bounded_minimum_equals_a_general_optimizer(seed: int) -> None:
+    """No weight exceeds 1, and the value is that of SLSQP within 1 % of the possible gain."""
     rng = np.random.default_rng(seed)
-    rows = rng.standard_normal((2 * n, n)) + 1j * rng.standard_normal((2 * n, n))
-    A = rows.conj().T @ rows
-    return A, 3 * A @ (rng.standard_normal(n) + 1j * rng.standard_normal(n)) / np.sqrt(n)
+    rows = rng.standard_normal((12, 6)) + 1j * rng.standard_normal((12, 6))
+    quadratic = rows.conj().T @ rows
+    unbounded = 3 * (rng.standard_normal((6, 2)) @ [1, 1j]) / np.sqrt(6)
+    linear = quadratic @ unbounded
 
+    def value(weights: ComplexArray) -> float:
+        return float((weights.conj() @ quadratic @ weights - 2 * linear.conj() @ weights).real)
 
-def value(A, b, x):
-    """What is minimised."""
-    return float((x.conj() @ A @ x - 2 * b.conj() @ x).real)
+    def value_of_parts(parts: FloatArray) -> float:
+        return value(parts[:6] + 1j * parts[6:])
 
+    def slack(parts: FloatArray) -> FloatArray:
+        return np.asarray(1 - parts[:6] ** 2 - parts[6:] ** 2)
 
-@pytest.mark.parametrize("seed", range(5))
-def test_bounded_minimum_equals_a_general_optimizer(seed):
-    """No bound is exceeded, and the value is that of SLSQP within 1 % of what is to be gained."""
-    A, b = random_form(seed, 6)
-    found = bounded_minimum(A, b.reshape(3, 2), np.eye(2)).ravel()
-    general = minimize(
-        lambda z: value(A, b, z[:6] + 1j * z[6:]),
+    minimum = bounded_minimum(quadratic, linear.reshape(3, 2), np.eye(2)).ravel()
+    reference = minimize(
+        value_of_parts,
         np.zeros(12),
         method="SLSQP",
-        constraints={"type": "ineq", "fun": lambda z: 1 - z[:6] ** 2 - z[6:] ** 2},
+        constraints={"type": "ineq", "fun": slack},
         options={"maxiter": 500, "ftol": 1e-12},
     )
-    assert np.abs(np.linalg.solve(A, b)).max() > 1  # the bounds are in the way
-    assert np.abs(found).max() <= 1
-    assert value(A, b, found) <= 0.99 * general.fun
+
+    assert np.abs(unbounded).max() > 1, "the bounds must matter"
+    assert np.abs(minimum).max() <= 1
+    assert value(minimum) <= 0.99 * reference.fun
 
 
-def terms(*fades: tuple[float, float, float, complex, complex]) -> Motion:
-    """The motion of a base by some fades."""
-    return [term for fade in fades for term in raised_cosine(*fade)]
+@pytest.mark.parametrize("bolt_mass", [0.0, 3.0])
+def test_plate_in_time_rejects_critical_damping(bolt_mass: float) -> None:
+    """At c = 2 sqrt(k m) two eigenvectors are one, and their inverse must not be used.
 
-
-ERA = Era("", 0, 0, stiffness=100.0**2, damping=2 * 100.0, bolt_mass=0.0, stroke=1e-4)
-"""Under one kilogram it is damped critically, in numbers that are exact."""
-
-PLATE = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
-THREE_MASSES = ReducedPlate(
-    PLATE, np.zeros(3), np.zeros(3), lambda points: np.eye(3)[: len(points)]
-)
-"""A kilogram on each of three ERAs, and nothing between them: as few coordinates as stand."""
-
-
-@pytest.mark.parametrize("mass", [0.0, 3.0])
-def test_plate_in_time_refuses_critical_damping(mass: float) -> None:
-    """c = 2 sqrt(k m): two eigenvectors are one, and nothing must be computed with their inverse.
-
-    With 1 + 3 kg and twice the damping as well, there the numbers make it singular altogether.
+    The plate is a kilogram on each of three ERAs, uncoupled, in numbers that are exact.
     """
-    factor = (1 + mass) ** 0.5
-    era = replace(ERA, bolt_mass=mass, damping=factor * ERA.damping)
-    eras = [replace(era, x=x, y=y) for x, y in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.1))]
+    root = math.sqrt(1 + bolt_mass)
+    plate = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
+
+    def identity_shapes(points: FloatArray) -> FloatArray:
+        return np.eye(3)[: len(points)]
+
+    def eras_with(damping: float) -> list[Era]:
+        positions = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
+        return [Era("", x, y, 100.0**2, damping, bolt_mass, stroke=1e-4) for x, y in positions]
+
+    masses = ReducedPlate(plate, np.zeros(3), np.zeros(3), identity_shapes)
     with pytest.raises(InputError, match="damped critically"):
-        plate_in_time(THREE_MASSES, eras)
-    softer = [replace(each, damping=0.999 * era.damping) for each in eras]
-    solved = plate_in_time(THREE_MASSES, softer)
-    assert np.abs(solved.eigenvalues) == pytest.approx(100 / factor)
+        plate_in_time(masses, eras_with(root * 200.0))
+
+    solved = plate_in_time(masses, eras_with(0.999 * root * 200.0))
+    assert np.abs(solved.eigenvalues) == pytest.approx(100 / root)

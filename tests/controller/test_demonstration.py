@@ -94,8 +94,8 @@ def test_felt_contrast_relates_levels_not_accelerations():
     target, quiet = vibration([[10 * low], [0.0]]), vibration([[0.0], [10 * low]])
     assert steady_contrast_db(target, [quiet]) == pytest.approx(20 * np.log10(high / low))
     assert steady_contrast_db(target, []) is None
-    both = vibration([[3 * low, 0.0], [4 * high, 0.0]])
-    assert steady_contrast_db(target, [both, quiet]) == pytest.approx(
+    mixed = vibration([[3 * low, 0.0], [4 * high, 0.0]])
+    assert steady_contrast_db(target, [mixed, quiet]) == pytest.approx(
         20 - 20 * np.log10(max(5, 10 * low / high))
     )
 
@@ -109,20 +109,20 @@ def test_felt_contrast_is_the_least_over_the_threshold_sets():
     low, high = detection_threshold(np.array([100.0, 250.0]))
     sets = ("vibrotactile-probe", "pressing-fingertip")
     target = replace(vibration([[0.0], [10 * high]]), thresholds=sets)
-    other = vibration([[10 * low], [0.0]])
-    assert target.level_db_sl == pytest.approx(other.loudest_db_sl)
-    assert steady_contrast_db(target, [other]) == pytest.approx(-3.0, abs=0.2)
+    single = vibration([[10 * low], [0.0]])
+    assert target.level_db_sl == pytest.approx(single.loudest_db_sl)
+    assert steady_contrast_db(target, [single]) == pytest.approx(-3.0, abs=0.2)
 
 
 def test_contents_are_told_apart_by_their_frequencies():
     """By hand: 10 times threshold of its own, 0.3 and 0.4 of others: 26 dB above their power."""
     thresholds = detection_threshold(np.array([90.0, 170.0, 260.0]))
     felt = vibration(np.diag(thresholds) @ [[10.0], [0.3], [0.4]], (90.0, 170.02, 260.0))
-    own, foreign = felt.parted(90.0)
-    assert own.level_db_sl == pytest.approx(20.0)
-    assert steady_contrast_db(own, [foreign]) == pytest.approx(20 + 6.02, abs=0.01)
-    nothing, all_others = felt.parted(500.0)
-    assert nothing.level_db_sl == -np.inf
+    content, foreign = felt.parted(90.0)
+    assert content.level_db_sl == pytest.approx(20.0)
+    assert steady_contrast_db(content, [foreign]) == pytest.approx(20 + 6.02, abs=0.01)
+    silence, all_others = felt.parted(500.0)
+    assert silence.level_db_sl == -np.inf
     assert all_others.level_db_sl == pytest.approx(felt.level_db_sl)
 
 
@@ -142,7 +142,7 @@ def test_promise_is_kept_by_at_least_the_promised_contrast():
 def test_json_has_the_documented_keys_of_every_touch():
     """Also of one that was not driven: without figures, but with the reason."""
     silent = replace(row(1.0, contrast=None, others=1), reason="too close")
-    figures = {f"{what}_{of}" for what in ("predicted", "measured") for of in FIGURES}
+    figures = {f"{kind}_{of}" for kind in ("predicted", "measured") for of in FIGURES}
     assert silent.as_json().keys() == {*figures, *PROMISED, *KEYS}
     assert silent.as_json()["quiet_m"] == [(0.1, 0.0)]
     shared = replace(silent, fingers=[FINGER])
@@ -199,15 +199,16 @@ def demo(
     why_void: that of the run.
     """
     rows = [
-        replace(each, drive=DRIVEN, latency_ms=9.62, predicted_level_db_sl=20.0) for each in ROWS
+        replace(touch_row, drive=DRIVEN, latency_ms=9.62, predicted_level_db_sl=20.0)
+        for touch_row in ROWS
     ]
 
     def run_era(*arguments: str, why_void: str | None = None) -> tuple[int, list[str]]:
-        async def run_demo(file: Path, table: object, *, on_row: Any, **more: Any) -> DemoRun:
+        async def run_demo(file: Path, table: object, *, on_row: Any, **options: Any) -> DemoRun:
             assert file.name == ("mine.yaml" if "mine.yaml" in arguments else "paper_plate.yaml")
-            assert len(more["scenes"]) == 2
-            for each in rows:
-                on_row(each)
+            assert len(options["scenes"]) == 2
+            for touch_row in rows:
+                on_row(touch_row)
             return DemoRun(rows, why_void)
 
         monkeypatch.setattr(demonstration, "run_demo", run_demo)
@@ -218,32 +219,32 @@ def demo(
         return Pictures([out / "t.png"], ["no contents.png: WHY"])
 
     monkeypatch.setattr(demo_pictures, "write_pictures", write_pictures)
-    monkeypatch.setattr(table_file, "cached_table", lambda rig, **more: (small_table(), None))
+    monkeypatch.setattr(table_file, "cached_table", lambda rig, **options: (small_table(), None))
     monkeypatch.chdir(tmp_path)
     shutil.copy(example_rig_path(), "mine.yaml")
     return run_era
 
 
 @pytest.mark.parametrize(
-    ("given", "then"),
+    ("arguments", "expected"),
     [((), "era config init my_rig.yaml"), (("mine.yaml",), "era table build mine.yaml")],
     ids=["example rig", "own rig"],
 )
 def test_lines_say_of_each_touch_what_was_promised_and_felt(
-    given: tuple[str, ...], then: str, demo: Demo
+    arguments: tuple[str, ...], expected: str, demo: Demo
 ) -> None:
     """By hand, of touches alone, kept, missed, silent, too short, still ringing, and of two people.
 
     With a rig of one's own its table comes next. Without a capture the scenes are the examples'.
     """
-    status, (head, arithmetic, scale, _, _, _, *lines) = demo(*given, "--real-time")
+    status, (head, arithmetic, scale, _, _, _, *lines) = demo(*arguments, "--real-time")
     assert status == 0
     assert re.search(r"\.yaml: table of 4 ERAs on a mesh of 12x9, ready in [0-9]\.\d s$", head)
     assert arithmetic.startswith("answers are computed by ")
     assert scale == SCALE
     assert "".join(lines).startswith(LINES)
     assert lines[-3:-1] == ["no contents.png: WHY\n", "wrote drawn/t.png\n"]
-    assert lines[-1].startswith(f"Next: {then}")
+    assert lines[-1].startswith(f"Next: {expected}")
 
 
 def test_void_run_prints_no_share_and_draws_nothing(demo: Demo) -> None:
@@ -266,9 +267,9 @@ def contact(number: int) -> Contact:
 @asynccontextmanager
 async def recorder_of(rows: list[TouchRow], **plate: AsyncMock) -> AsyncIterator[TouchRecorder]:
     """A recorder of a plate that is not there, by what it replies; its rows are made at the end."""
-    asked = SimpleNamespace(**{"vibration": AsyncMock(), "place_fingers": AsyncMock(), **plate})
+    doubles = SimpleNamespace(**{"vibration": AsyncMock(), "place_fingers": AsyncMock(), **plate})
     async with asyncio.TaskGroup() as tasks:
-        yield TouchRecorder(cast(SimulatedPlate, asked), tasks, on_row=rows.append)
+        yield TouchRecorder(cast(SimulatedPlate, doubles), tasks, on_row=rows.append)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +278,7 @@ async def recorder_of(rows: list[TouchRow], **plate: AsyncMock) -> AsyncIterator
 def test_run_is_void_when_sensors_follow_a_finger_too_late(delay: float, is_void: bool) -> None:
     """After 150 ms a window of 250 ms at the end of a pattern of 400 ms may contain the move."""
 
-    async def place_slowly(*given: object) -> None:
+    async def place_slowly(*arguments: object) -> None:
         await asyncio.sleep(delay)
 
     async def play() -> str | None:
@@ -317,9 +318,9 @@ def test_demo_gives_the_same_rows_on_a_slow_machine(monkeypatch: pytest.MonkeyPa
     prompt = rows()
     read = TuioSource.read
 
-    def read_slowly(self: TuioSource, *given: Any) -> TouchFrame | None:
+    def read_slowly(self: TuioSource, *arguments: Any) -> TouchFrame | None:
         time.sleep(0.02)
-        return read(self, *given)
+        return read(self, *arguments)
 
     monkeypatch.setattr(TuioSource, "read", read_slowly)
     assert rows() == prompt

@@ -48,7 +48,7 @@ def test_socket_is_for_its_user_and_the_group_of_its_folder_only(
 
     Whatever the umask, which stays; removed at the end.
     """
-    before, path = os.umask(0), tmp_path / "new" / "era.sock"
+    mask, path = os.umask(0), tmp_path / "new" / "era.sock"
     try:
         if folder is not None:
             path.parent.mkdir()
@@ -62,7 +62,7 @@ def test_socket_is_for_its_user_and_the_group_of_its_folder_only(
         lock.release()
         assert not path.exists()
     finally:
-        os.umask(before)
+        os.umask(mask)
 
 
 def test_client_that_sees_the_socket_is_never_refused(
@@ -83,7 +83,7 @@ def test_client_that_sees_the_socket_is_never_refused(
     with lock.bind(), socket.socket(socket.AF_UNIX) as client:
         client.connect(str(path))
     lock.release()
-    assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["era.sock.lock"]
 
 
 def test_socket_that_cannot_be_locked_or_listen_is_no_second_daemon(
@@ -104,7 +104,7 @@ def test_socket_that_cannot_be_locked_or_listen_is_no_second_daemon(
     monkeypatch.setattr(socket, "socket", deaf)
     with pytest.raises(InputError, match="in use"):
         lock.bind()
-    assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["era.sock.lock"]
     lock.release()
 
 
@@ -188,7 +188,7 @@ def test_socket_lock_leaves_other_files_alone(tmp_path: Path, kind: str) -> None
             path.symlink_to(tmp_path / "nowhere")
     with pytest.raises(InputError, match=str(path)):
         SocketLock(path)
-    assert [each.name for each in tmp_path.iterdir()] == ["there"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["there"]
 
 
 MODULE = "era_test_commands"
@@ -375,13 +375,13 @@ def test_main_ends_quietly_and_prints_what_its_output_cannot_encode(
         flood.stdout.close()
         assert flood.stderr.read() == ""
         assert flood.wait() == 141
-    for command, given, said in (
+    for command, printed, output in (
         ("letters", {"PYTHONIOENCODING": "ascii"}, "m/s\\xb2 p\\udcfc\n"),
         ("good", {}, "number 1 1\n"),
         ("good", {"OMP_NUM_THREADS": "7"}, "number 1 7\n"),
     ):
-        with run_typed(tmp_path, command, **given) as done:
-            assert done.communicate()[0] == said
+        with run_typed(tmp_path, command, **printed) as done:
+            assert done.communicate()[0] == output
             assert done.returncode == 0
 
 
@@ -407,7 +407,7 @@ print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.module
 
 
 @pytest.mark.parametrize(
-    ("which", "others"),
+    ("command", "own_modules"),
     [
         ("", set()),
         # typer describes the options of a command with pydantic where that is installed.
@@ -418,16 +418,16 @@ print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.module
         ),
     ],
 )
-def test_help_loads_commands_and_typer_alone(which: str, others: set[str]) -> None:
+def test_help_loads_commands_and_typer_alone(command: str, own_modules: set[str]) -> None:
     """So that it is quick."""
     done = subprocess.run(
-        [sys.executable, "-c", LOADED, which], capture_output=True, text=True, check=True
+        [sys.executable, "-c", LOADED, command], capture_output=True, text=True, check=True
     )
     count, *loaded = done.stdout.split()
-    assert int(count) == 1 if not which else int(count) > 40
+    assert int(count) == 1 if not command else int(count) > 40
     typers = {"typer", "annotated_doc", "shellingham", "typing_extensions", "typing_inspection"}
     of_the_environment = {"_distutils_hack"}  # of setuptools
-    assert set(loaded) - set(PACKAGES) - typers - of_the_environment - others == set()
+    assert set(loaded) - set(PACKAGES) - typers - of_the_environment - own_modules == set()
 
 
 def test_summaries_of_commands_fit_in_80_columns() -> None:
@@ -449,10 +449,10 @@ def test_summaries_of_commands_fit_in_80_columns() -> None:
 )
 def test_bash_completes_commands_and_options(typed: str, words: set[str]) -> None:
     """By the script that `era --show-completion` prints for the shell that runs it."""
-    *before, last = typed.split()
+    *earlier_words, last = typed.split()
     script = (
         'script=$(era --show-completion) && eval "$script" && '
-        f"COMP_WORDS=({typed}) COMP_CWORD={len(before)} && _era_completion era {last} {before[-1]} "
+        f"COMP_WORDS=({typed}) COMP_CWORD={len(earlier_words)} && _era_completion era {last} {earlier_words[-1]} "
         '&& echo "${COMPREPLY[@]}"'
     )
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
@@ -481,9 +481,9 @@ def test_main_loads_every_package_of_the_project(
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
     """A record of a logging call at a line."""
-    made = logging.LogRecord("era.x", logging.WARNING, "/x.py", line, message, (), None)
-    made.__dict__.update(extra)
-    return made
+    log_record = logging.LogRecord("era.x", logging.WARNING, "/x.py", line, message, (), None)
+    log_record.__dict__.update(extra)
+    return log_record
 
 
 def test_log_lines_cannot_be_forged_and_are_bounded() -> None:
@@ -499,18 +499,18 @@ def test_log_lines_cannot_be_forged_and_are_bounded() -> None:
 
 def test_log_line_has_the_keys_of_its_page() -> None:
     """Time in UTC with milliseconds, level, logger, message, what a call adds, and a traceback."""
-    made = record("link: %s", cause=OSError("gone"), remedy=None, skipped=3)
-    made.args = ("lost",)
-    made.created, made.msecs = 1_000_000_000.25, 250.0
+    log_record = record("link: %s", cause=OSError("gone"), remedy=None, skipped=3)
+    log_record.args = ("lost",)
+    log_record.created, log_record.msecs = 1_000_000_000.25, 250.0
     expected = {"time": "2001-09-09T01:46:40.250Z", "level": "warning", "logger": "era.x"}
-    more = {"message": "link: lost", "cause": "gone", "remedy": None, "skipped": 3}
-    assert json.loads(LogFormatter().format(made)) == {**expected, **more}
+    extra = {"message": "link: lost", "cause": "gone", "remedy": None, "skipped": 3}
+    assert json.loads(LogFormatter().format(log_record)) == {**expected, **extra}
     try:
         raise ValueError("x" * 10**5)
     except ValueError:
-        made.exc_info = sys.exc_info()
-    fields = json.loads(LogFormatter().format(made))
-    assert fields.keys() - expected.keys() - more.keys() == {"traceback"}
+        log_record.exc_info = sys.exc_info()
+    fields = json.loads(LogFormatter().format(log_record))
+    assert fields.keys() - expected.keys() - extra.keys() == {"traceback"}
     assert fields["traceback"] == "x" * 8000
 
 
@@ -533,10 +533,10 @@ def test_log_limits_rate_of_each_call_except_state_changes() -> None:
 @pytest.fixture
 def logger() -> Iterator[logging.Logger]:
     """A logger without handlers."""
-    made = logging.getLogger("era.test_daemon_log")
-    made.propagate = False
-    yield made
-    made.handlers.clear()
+    log = logging.getLogger("era.test_daemon_log")
+    log.propagate = False
+    yield log
+    log.handlers.clear()
 
 
 @contextmanager
@@ -589,8 +589,8 @@ def test_full_disk_cuts_no_line_of_the_log(logger: logging.Logger, tmp_path: Pat
     with logging_to(logger, tmp_path / "log") as thread:
         thread.subscriber = lambda record: heard.append(record.getMessage())
         with full_disk(at=1024):  # bytes, amid the third line
-            for each in messages:
-                logger.debug(each)
+            for message in messages:
+                logger.debug(message)
             wait_for(lambda: not thread.queue.unfinished_tasks)
         logger.info("after")
     assert heard == ["after"]
@@ -643,13 +643,13 @@ def test_service_manager_is_told_and_its_watchdog_fed_at_twice_its_rate(
             {"NOTIFY_SOCKET": "/nowhere/at/all"},
             {"NOTIFY_SOCKET": path, **more},
         ):
-            with closing(ServiceManager(environment)) as told, monkeypatch.context() as patched:
+            with closing(ServiceManager(environment)) as manager, monkeypatch.context() as patched:
                 no_descriptor = Mock(side_effect=OSError(errno.EMFILE, "too many"))
                 patched.setattr(socket, "socket", no_descriptor)
-                told.ready("all is well\nERRNO=5")
+                manager.ready("all is well\nERRNO=5")
                 for milliseconds in range(0, 3500, 50):
-                    told.alive(milliseconds / 1000)
-                told.notify("STOPPING=1")
+                    manager.alive(milliseconds / 1000)
+                manager.notify("STOPPING=1")
         assert bound.recv(4096).startswith(b"READY=1\nSTATUS=all is wellERRNO=5")
         messages = []
         while (message := bound.recv(100)) != b"STOPPING=1":

@@ -101,9 +101,9 @@ class Place:
         """Status and error of the gateway; head: in place of type and length of the body."""
         request = request or f"POST /api/v1/{method} HTTP/1.1"
         head = head or f"Content-Type: application/json\r\nContent-Length: {len(body)}"
-        who = f"Host: {self.gateway.host}\r\nAuthorization: Bearer {TOKEN}"
+        credentials = f"Host: {self.gateway.host}\r\nAuthorization: Bearer {TOKEN}"
         with self.gateway.connect() as connection:
-            connection.sendall(f"{request}\r\n{who}\r\n{head}\r\n\r\n".encode() + body)
+            connection.sendall(f"{request}\r\n{credentials}\r\n{head}\r\n\r\n".encode() + body)
             if closes:
                 connection.shutdown(socket.SHUT_WR)
             with connection.makefile("rb") as received:
@@ -359,18 +359,18 @@ KEYS = TEXT | st.sampled_from(["jsonrpc", "id", "params", "method"])
 @given(
     method=st.sampled_from(sorted(SILENCING)),
     members=st.dictionaries(KEYS, VALUES, max_size=5),
-    others=st.lists(VALUES, max_size=2),
+    batch=st.lists(VALUES, max_size=2),
     is_batch=st.booleans(),
     position=st.integers(0, 5),
 )
 def test_any_object_whose_method_silences_silences(
-    method: str, members: dict[str, Any], others: list[Any], is_batch: bool, position: int
+    method: str, members: dict[str, Any], batch: list[Any], is_batch: bool, position: int
 ) -> None:
     """Whatever else it has, and whatever else is in its batch; it is called once."""
     pairs = [*members.items()]
     pairs = [pair for pair in pairs if pair[0] != "method"]
     pairs.insert(position, ("method", method))
-    document: Any = [*others, dict(pairs)] if is_batch else dict(pairs)
+    document: Any = [*batch, dict(pairs)] if is_batch else dict(pairs)
     line = json.dumps(document).encode() + b"\n"
 
     async def served() -> list[str]:

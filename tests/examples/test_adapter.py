@@ -82,7 +82,7 @@ class Instrument:
         Channels are numbered from 1.
         """
         output = self.outputs[channel - 1]
-        times = np.arange(10_000) / 10_000.0 + max(each.origin for each in self.outputs)
+        times = np.arange(10_000) / 10_000.0 + max(output.origin for output in self.outputs)
         angle = 2 * np.pi * output.frequency * (times - output.origin) + np.radians(output.phase)
         voltage = output.is_on * (output.offset + output.amplitude / 2 * np.sin(angle))
         wave = np.exp(-2j * np.pi * frequency * (times - times[0]))
@@ -108,8 +108,8 @@ class Instrument:
         if header == "SYST:ERR?":
             code, text = self.errors.popleft() if self.errors else (0, "No error")
             return f'{code:+d},"{text}"'
-        if found := re.fullmatch(r"OUTP([12])\?", header):
-            return str(int(self.outputs[int(found[1]) - 1].is_on))
+        if match := re.fullmatch(r"OUTP([12])\?", header):
+            return str(int(self.outputs[int(match[1]) - 1].is_on))
         return {"*OPC?": "1", "*ESE?": f"{self.event_enable:+d}"}[header]
 
     def _told(self, header: str, argument: str) -> bool:
@@ -120,30 +120,30 @@ class Instrument:
             self.errors.clear()
         elif header == "SOUR1:PHAS:SYNC":
             self.outputs[0].origin = self.outputs[1].origin = threads.now()
-        elif found := re.fullmatch(r"(?:SOUR|OUTP)([12]):?(.*)", header):
-            return self._set(self.outputs[int(found[1]) - 1], found[2], argument)
+        elif match := re.fullmatch(r"(?:SOUR|OUTP)([12]):?(.*)", header):
+            return self._set(self.outputs[int(match[1]) - 1], match[2], argument)
         else:
             return (header, argument) in (("*WAI", ""), ("UNIT:ANGL", "DEG"))
         return True
 
-    def _set(self, output: Output, what: str, argument: str) -> bool:
+    def _set(self, output: Output, parameter: str, argument: str) -> bool:
         set_up = {"LOAD": "INF", "FUNC": "SIN", "VOLT:UNIT": "VPP"}
-        if what in set_up:
-            return argument == set_up[what]
-        if what == "" and argument in ("ON", "OFF"):
+        if parameter in set_up:
+            return argument == set_up[parameter]
+        if parameter == "" and argument in ("ON", "OFF"):
             output.is_on = argument == "ON"
             return True
-        low, high = RANGES.get(what, (-360.0, 360.0))
+        low, high = RANGES.get(parameter, (-360.0, 360.0))
         value = low if argument == "MIN" else float(argument)
         if not low <= value <= high:
             self.errors.append((-222, "Data out of range; value clipped"))
         value = min(max(value, low), high)
-        if what == "FREQ" and value != output.frequency:
+        if parameter == "FREQ" and value != output.frequency:
             # The phase accumulator goes on: where it stands is not known.
             output.origin = threads.now() - 0.123 / value
-        if what in NUMBERS:
-            setattr(output, NUMBERS[what], value)
-        return what in NUMBERS
+        if parameter in NUMBERS:
+            setattr(output, NUMBERS[parameter], value)
+        return parameter in NUMBERS
 
 
 SCRIPT = Path(era_haptics.__file__).parents[1] / "examples" / "adapter" / "scpi.py"
@@ -247,10 +247,10 @@ async def state(host: Amplifier, name: str) -> None:
                 return
 
 
-async def failing(group: Group, one: AmplifierLayer) -> None:
+async def failing(group: Group, layer: AmplifierLayer) -> None:
     """Play until that fails."""
     async with asyncio.timeout(PATIENCE):
-        await group.apply({"a": [one]})
+        await group.apply({"a": [layer]})
         while True:
             await group.beat()
 
@@ -268,14 +268,14 @@ async def test_force_is_that_of_the_set_and_follows_it() -> None:
         first, second = instrument.force(1, 100.0), instrument.force(2, 100.0)
         assert (abs(first), abs(second)) == pytest.approx((0.25, 1.0), rel=1e-3)
         assert np.degrees(np.angle(first / second)) == pytest.approx(120.0, abs=0.1)
-        before = len(instrument.log)
+        log_length = len(instrument.log)
         await group.apply({"a": [layer(0.64, ramp=1.0, keep_phase=True)]})
         async with asyncio.timeout(PATIENCE):
             while abs(instrument.force(1, 100.0)) < 0.6399:
                 await host.read_status()
-        followed = instrument.log[before:]
-        assert sum("SOUR1:VOLT" in each for each in followed) > 2
-        assert not any("PHAS:SYNC" in each for each in followed)
+        followed = instrument.log[log_length:]
+        assert sum("SOUR1:VOLT" in command for command in followed) > 2
+        assert not any("PHAS:SYNC" in command for command in followed)
         assert np.degrees(np.angle(instrument.force(1, 100.0) / second)) == pytest.approx(
             120.0, abs=0.1
         )
@@ -306,13 +306,15 @@ async def test_mute_instrument_is_never_reported_silent() -> None:
         await instrument.until_silent()
 
 
-@pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGSTOP])
-async def test_ended_or_stalled_adapter_is_silenced_by_its_watcher(what: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGSTOP])
+async def test_ended_or_stalled_adapter_is_silenced_by_its_watcher(
+    signal_number: signal.Signals,
+) -> None:
     """Killed or paused while it plays; one that was paused ends when it goes on."""
     async with playing() as (instrument, program, _group, _host):
-        program.send_signal(what)
+        program.send_signal(signal_number)
         await instrument.until_silent()
-        if what is signal.SIGSTOP:
+        if signal_number is signal.SIGSTOP:
             program.send_signal(signal.SIGCONT)
         assert await ended(program) != 0
 
@@ -351,11 +353,11 @@ async def test_adapter_ends_although_a_request_comes_at_the_same_moment(turns: i
     """However many turns of the event loop lie between the request and the end."""
     adapter = runpy.run_path(str(SCRIPT.with_name("adapter.py")))["Adapter"]
     device = Quiet()
-    one = adapter("a", device, lambda sign: None)
-    running = asyncio.ensure_future(one.run())
+    first_adapter = adapter("a", device, lambda sign: None)
+    running = asyncio.ensure_future(first_adapter.run())
     await device.is_silent.wait()
     await asyncio.sleep(0.01)
-    one._receive(b"")
+    first_adapter._receive(b"")
     for _ in range(turns):
         await asyncio.sleep(0)
     running.cancel()

@@ -84,19 +84,19 @@ def test_the_board_is_found_from_the_file_of_its_sensor(tmp_path: Path, capsys) 
 
     No sheet tells force factors to less than 20 %; with its gain each is known by the responses.
     """
-    found = tmp_path / "calibrated.yaml"
+    calibrated = tmp_path / "calibrated.yaml"
     believed = shutil.copy(WEEKEND / "rig.yaml", tmp_path)
-    arguments = [str(believed), str(WEEKEND / "measured.uff"), "-o", str(found)]
+    arguments = [str(believed), str(WEEKEND / "measured.uff"), "-o", str(calibrated)]
     assert run_era(["calibrate", *arguments, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["held_out"]["error_after"] < 0.05
     true = BuiltBoard.drawn(load_rig(WEEKEND / "rig.yaml"), 0).rig.plate
-    rig = load_rig(found)
+    rig = load_rig(calibrated)
     rigidity = rig.plate.flexural_rigidity / rig.plate.mass
     assert rigidity == pytest.approx(true.flexural_rigidity / true.mass, rel=0.02)
     assert rig.uncertainty.gain < 0.1
     sizes, errors = (
-        np.concatenate([each[key] for each in report["gains"].values()])
+        np.concatenate([gains[key] for gains in report["gains"].values()])
         for key in ("magnitude", "standard_error")
     )
     assert np.median(errors / sizes) < 0.1
@@ -113,17 +113,17 @@ BY_MACHINE = {"clock_rate", "replies_in_time"}
 @asynccontextmanager
 async def served(kind: str) -> AsyncIterator[str]:
     """The example on a TCP port, or on a pseudo-terminal that is joined to another; its URL."""
-    here = make_terminal(lambda data: there.write(data))
-    there = make_terminal(here.write)
-    with closing(here), closing(there):
-        for each in (here, there):
-            each.listen()
-        place = ["0"] if kind == "tcp" else [there.port, "N"]
+    near_end = make_terminal(lambda data: far_end.write(data))
+    far_end = make_terminal(near_end.write)
+    with closing(near_end), closing(far_end):
+        for terminal in (near_end, far_end):
+            terminal.listen()
+        place = ["0"] if kind == "tcp" else [far_end.port, "N"]
         command = sys.executable, str(EXAMPLE), kind, *place
         process = await asyncio.create_subprocess_exec(*command, stdout=PIPE)
         try:
             url = (await process.stdout.readline()).decode().strip()
-            yield url.replace(there.port, here.port)
+            yield url.replace(far_end.port, near_end.port)
         finally:
             process.terminate()
             await process.wait()
@@ -144,15 +144,17 @@ async def test_conformance_finds_what_the_server_cannot_do(
     async with served(kind) as url:
         report = await asyncio.to_thread(judge, url, may_drive=lambda count: drives)
     checks = [(number, check) for number, check in of_kind(kind) if drives or not check.drives]
-    assert [(each.number, each.check) for each in report.results] == checks
-    failed = {each.check.name: each.reason for each in report.results if each.result == "failed"}
-    skipped = {each.check.name for each in report.results if each.result == "skipped"}
-    left = {each.check.name for each in report.results if each.result == "not_run"}
+    assert [(result.number, result.check) for result in report.results] == checks
+    failed = {
+        result.check.name: result.reason for result in report.results if result.result == "failed"
+    }
+    skipped = {result.check.name for result in report.results if result.result == "skipped"}
+    not_run = {result.check.name for result in report.results if result.result == "not_run"}
     names = {check.name for _, check in checks}
     assert set(failed) - BY_MACHINE == names & FAILED, failed
-    assert skipped - BY_MACHINE == names & SKIPPED - left
+    assert skipped - BY_MACHINE == names & SKIPPED - not_run
     # It does not reply behind a request of another function, so that none can see it silent.
-    assert bool(left) == (drives and kind == "rtu")
+    assert bool(not_run) == (drives and kind == "rtu")
 
 
 AT_HOME = ("era-sound-server", "era-soft-amp", "era-plate")
@@ -176,9 +178,9 @@ def exposure(program: str, unit: Path, *options: str) -> float:
         text=True,
         env=os.environ | {"XDG_RUNTIME_DIR": str(unit.parent)},
     )
-    found = re.search(rf"Overall exposure level for {unit.name}: ([\d.]+)", judged.stdout)
-    assert found is not None, judged.stderr
-    return float(found[1])
+    match = re.search(rf"Overall exposure level for {unit.name}: ([\d.]+)", judged.stdout)
+    assert match is not None, judged.stderr
+    return float(match[1])
 
 
 def allows(program: str, unit: str, call: str) -> bool:
@@ -240,9 +242,9 @@ def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -
             assert "RestrictRealtime" not in texts[name]
             assert "@resources" not in texts[name]
             assert all(allows(program, texts[name], call) for call in REAL_TIME)
-    for before, name in pairwise(AT_HOME):
+    for predecessor, name in pairwise(AT_HOME):
         for key in ("Wants", "After"):
-            assert f"\n{key}={before}.service\n" in texts[name]
+            assert f"\n{key}={predecessor}.service\n" in texts[name]
     rig = yaml.safe_load((WEEKEND / "rig.yaml").read_text("utf-8"))
     (amplifier,) = rig["amplifiers"].values()
     (link,) = re.findall(r"--link (\S+)", texts["era-soft-amp"])
@@ -330,9 +332,9 @@ LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 @pytest.fixture
 def address(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The class of the example, which opens all URLs."""
-    made = runpy.run_path(str(PLUGINS / "wire" / "unix_wire.py"))["UnixAddress"]
-    monkeypatch.setattr(opening, "address_of", made)
-    return made
+    module = runpy.run_path(str(PLUGINS / "wire" / "unix_wire.py"))["UnixAddress"]
+    monkeypatch.setattr(opening, "address_of", module)
+    return module
 
 
 @asynccontextmanager
@@ -378,9 +380,9 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
         await group.arm()
         layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
         await group.apply(dict.fromkeys(amplifiers, layers))
-        statuses = [await each.read_status() for each in amplifiers.values()]
+        statuses = [await amplifier.read_status() for amplifier in amplifiers.values()]
         assert [status["levels"] for status in statuses] == [[5000], [5000]]
-        assert all(each.is_confirmed for each in (await group.stop()).values())
+        assert all(amplifier.is_confirmed for amplifier in (await group.stop()).values())
         amplifiers["1"].line._port.write(b"hang up")
         async with asyncio.timeout(60.0):
             with pytest.raises(LinkError, match="was lost"):
@@ -433,12 +435,12 @@ class SmallestEnd:
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program as a library whose time is that of its caller."""
-    made = tmp_path_factory.mktemp("smallest") / "moved.so"
+    library = tmp_path_factory.mktemp("smallest") / "moved.so"
     compiler = installed_program("cc", package="gcc")
-    command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", made]
+    command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", library]
     command += [ROOT / "tests" / "support" / "moved_smallest.c", "-lm"]
     subprocess.run(command, check=True)
-    return made
+    return library
 
 
 @pytest.fixture
@@ -461,18 +463,23 @@ SOME_CHECKS = (
 
 @pytest.mark.parametrize(
     ("level", "names"),
-    [(0.2, SOME_CHECKS), *(pytest.param(each, (), marks=pytest.mark.long) for each in (0.2, 0.9))],
+    [
+        (0.2, SOME_CHECKS),
+        *(pytest.param(result, (), marks=pytest.mark.long) for result in (0.2, 0.9)),
+    ],
 )
 def test_conformance_on_a_clock_that_is_moved(
     level: float, names: tuple[str, ...], library: Path
 ) -> None:
     """All checks pass, where time is that of the test, and its sums of layers are limited."""
-    found = judged("serial", names, level=level, far=partial(SmallestEnd, library))
-    failed = [f"{each.check.name}: {each.reason}" for each in found if each.result == "failed"]
+    results = judged("serial", names, level=level, far=partial(SmallestEnd, library))
+    failed = [
+        f"{result.check.name}: {result.reason}" for result in results if result.result == "failed"
+    ]
     assert not failed, failed[0]
-    skipped = {each.check.name for each in found if each.result == "skipped"}
+    skipped = {result.check.name for result in results if result.result == "skipped"}
     lacking = NOT_IN_SMALLEST if level < 0.5 else NOT_IN_SMALLEST - {"limited"}
-    assert skipped == lacking & {each.check.name for each in found}
+    assert skipped == lacking & {result.check.name for result in results}
 
 
 @pytest.mark.parametrize(
@@ -569,7 +576,7 @@ def test_javascript_client_finds_the_socket_that_the_commands_find(
     client = ROOT / "examples" / "javascript" / "era_client.mjs"
     program = f"import({json.dumps(str(client))}).then(m => console.log(m.defaultSocket()))"
     node = installed_program("node", "nodejs", package="nodejs")
-    found = subprocess.run(
+    process = subprocess.run(
         [node, "-e", program],
         env={"PATH": os.environ["PATH"], **environment},
         capture_output=True,
@@ -577,7 +584,7 @@ def test_javascript_client_finds_the_socket_that_the_commands_find(
         check=True,
     )
     expected = default_socket({"PATH": os.environ["PATH"], **environment})
-    assert found.stdout.strip() == str(expected)
+    assert process.stdout.strip() == str(expected)
 
 
 @pytest.mark.real_time
@@ -602,8 +609,8 @@ async def test_button_is_felt_and_ends_safely(tmp_path: Path) -> None:
             pattern = (await next_event(era, "pattern")).data
         status, out, err = await ended(process)
         assert (status, err) == (0, "")
-        (shown,) = re.findall(r"felt contrast (\S+) dB", out)
-        assert float(shown) == pytest.approx(pattern["predicted_contrast_db"], abs=0.05)
+        (contrast,) = re.findall(r"felt contrast (\S+) dB", out)
+        assert float(contrast) == pytest.approx(pattern["predicted_contrast_db"], abs=0.05)
         assert await until_state(era, READY) == READY
         assert not (await era.status()).contacts
         process = await started(bench, QUIET, TARGET)
@@ -651,9 +658,9 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
         for connection in list(bench.daemon.server.clients):
             connection.abort()
         async with asyncio.timeout(PATIENCE):
-            left = later = (await era.status()).lease_left_s
-            while later is not None and later <= left:  # until it is renewed
-                left = later
+            lease_left = later = (await era.status()).lease_left_s
+            while later is not None and later <= lease_left:  # until it is renewed
+                lease_left = later
                 await asyncio.sleep(0.05)
                 later = (await era.status()).lease_left_s
         assert (await era.status()).armed_by == "javascript"
@@ -667,13 +674,13 @@ async def test_connection_is_made_again_with_topics_and_lease(tmp_path: Path) ->
 
 @pytest.mark.real_time
 @pytest.mark.parametrize(
-    ("place", "expected", "said"), [(TARGET, 1, "nosuch.sock"), ("0.1", 2, "X,Y [X,Y ...]")]
+    ("place", "expected", "message"), [(TARGET, 1, "nosuch.sock"), ("0.1", 2, "X,Y [X,Y ...]")]
 )
-async def test_without_a_daemon_it_says_so(place: str, expected: int, said: str) -> None:
+async def test_without_a_daemon_it_says_so(place: str, expected: int, message: str) -> None:
     """One line on standard error and its status; what is no place is refused before."""
     status, _, err = await ended(await started(None, place))
     assert status == expected
-    assert said in err
+    assert message in err
     assert len(err.splitlines()) == 1
 
 
@@ -699,7 +706,7 @@ def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
         subprocess.run(package["scripts"]["prepack"], cwd=source, check=True, shell=True)
         installed.mkdir(parents=True)
         for path in [
-            path for kept in (*package["files"], "package.json") for path in source.glob(kept)
+            path for pattern in (*package["files"], "package.json") for path in source.glob(pattern)
         ]:
             shutil.copy(path, installed)
     api = (installed / "api.d.ts").read_text("utf-8")
@@ -714,9 +721,11 @@ def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
         has = json.loads(done.stdout)
         types = (installed / export["types"]).read_text("utf-8")
         assert set(re.findall(r"^export (?:class|function) (\w+)", types, re.M)) == has.keys()
-        for made, body in re.findall(r"^export class (\w+).*?\{\n(.*?)^\}", types, re.M | re.S):
+        for class_name, body in re.findall(
+            r"^export class (\w+).*?\{\n(.*?)^\}", types, re.M | re.S
+        ):
             methods = set(re.findall(r"^  (?:static )?(\w+)[<(]", body, re.M))
-            assert methods - {"constructor", "on"} <= set(has[made])
-        known = re.findall(r"^export (?:type|interface) (\w+)", api, re.M)
+            assert methods - {"constructor", "on"} <= set(has[class_name])
+        exported = re.findall(r"^export (?:type|interface) (\w+)", api, re.M)
         for used in re.findall(r"import type \{(.*?)\} from \"./api.js\"", types):
-            assert set(re.findall(r"\w+", used)) <= set(known)
+            assert set(re.findall(r"\w+", used)) <= set(exported)

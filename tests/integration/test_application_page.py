@@ -86,8 +86,8 @@ async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack,
         open_browser(tmp_path / "profile") as browser,
         browser.open_page() as tab,
     ):
-        own = text.replace(GATEWAY, f"http://127.0.0.1:{network.port}/")
-        (folder / "plate.html").write_text(own, encoding="utf-8")
+        page_text = text.replace(GATEWAY, f"http://127.0.0.1:{network.port}/")
+        (folder / "plate.html").write_text(page_text, encoding="utf-8")
         with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, ExitStack() as ended:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             ended.callback(server.shutdown)

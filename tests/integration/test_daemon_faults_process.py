@@ -136,7 +136,7 @@ async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
     ):
         await armed(era)
         async with holding(era, (0.08, 0.1), (0.22, 0.1)), asyncio.timeout(PATIENCE):
-            while {each.held_back for each in (await era.status()).contacts} != {  # noqa: ASYNC110
+            while {contact.held_back for contact in (await era.status()).contacts} != {  # noqa: ASYNC110
                 GIVEN_UP
             }:
                 await asyncio.sleep(0.05)
@@ -196,9 +196,9 @@ async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None
             await until(lambda: not serves())
 
 
-def limited(pid: int, what: int, limit: int) -> tuple[int, int]:
+def limited(pid: int, resource_id: int, limit: int) -> tuple[int, int]:
     """Set a soft limit of a running process; return the previous limits."""
-    return resource.prlimit(pid, what, (limit, resource.prlimit(pid, what)[1]))
+    return resource.prlimit(pid, resource_id, (limit, resource.prlimit(pid, resource_id)[1]))
 
 
 def numbers_in(folder: str) -> list[int]:
@@ -259,7 +259,7 @@ async def test_daemon_loses_only_log_lines_when_disk_is_full(tmp_path: Path) -> 
     log = "log: {file: era.log}\n"
     async with playing_daemon(tmp_path, log, waits=False) as (daemon, era, journal):
         pid, far = daemon.process.pid, daemon.far
-        before = limited(pid, resource.RLIMIT_FSIZE, 0)
+        limits = limited(pid, resource.RLIMIT_FSIZE, 0)
         size = (tmp_path / "era.log").stat().st_size
         assert size > 0
         await plays_on("disk full", daemon, era, journal)
@@ -270,7 +270,7 @@ async def test_daemon_loses_only_log_lines_when_disk_is_full(tmp_path: Path) -> 
         os.kill(pid, signal.SIGHUP)
         await plays_on("disk full, after a fault", daemon, era, journal)
         assert (tmp_path / "era.log").stat().st_size == size
-        resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, limits)
         await disarmed(era)
         await until(lambda: (tmp_path / "era.log").stat().st_size > size)
 
@@ -321,19 +321,19 @@ async def test_daemon_plays_on_beside_a_second_one_and_without_descriptors(tmp_p
             assert f"process {pid}" in err
             text = (tmp_path / "daemon.yaml").read_text("utf-8")
             (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
-            other = await asyncio.create_subprocess_exec(
+            second_daemon = await asyncio.create_subprocess_exec(
                 *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
             )
             await until((tmp_path / "b.sock").is_socket)
             async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
                 await until_state(waiting, "COMM_LOST")
-            other.terminate()
-            _, log = await other.communicate()
+            second_daemon.terminate()
+            _, log = await second_daemon.communicate()
             assert b"Traceback" not in log
             assert (await era.status()).state == "OPERATION_ENABLED"
         await play(era, daemon.far)
         await until(lambda: any(daemon.far.summary().levels))
-        before = limited(pid, resource.RLIMIT_NOFILE, max(numbers_in(f"/proc/{pid}/fd")) + 1)
+        limits = limited(pid, resource.RLIMIT_NOFILE, max(numbers_in(f"/proc/{pid}/fd")) + 1)
         waiting = []
         try:
             for _ in range(40):
@@ -347,12 +347,12 @@ async def test_daemon_plays_on_beside_a_second_one_and_without_descriptors(tmp_p
             assert not journal.raising_since(stopped)
             await ready(era)
         finally:
-            resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
-            for each in waiting:
-                each.close()
+            resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
+            for connection in waiting:
+                connection.close()
         await plays_on("descriptors again", daemon, era, journal)
-        async with await daemon.client() as other:
-            await other.stop()
+        async with await daemon.client() as second_daemon:
+            await second_daemon.stop()
 
 
 KILLS = 8  # `make kill-test` takes two hundred
@@ -484,7 +484,11 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
         target = heard.steady[heard.situation.felt_at]
         frequencies = np.array(target.frequencies)
         level = mean_level_db_sl(frequencies, target.amplitude, target.weights)
-        (contact,) = [one for one in heard.patterns[-1]["contacts"] if one["role"] == "target"]
+        (contact,) = [
+            candidate
+            for candidate in heard.patterns[-1]["contacts"]
+            if candidate["role"] == "target"
+        ]
         assert math.isclose(contact["level_db_sl"], LEVEL_DB_SL, abs_tol=1e-5)
         fields = {
             place: np.abs(truth.fields(heard, truth.fingertip(place))[1])
@@ -560,13 +564,13 @@ def plate_decays(played: Played, truth: Truth) -> None:
     In the last 20 ms of a pause of 0.2 s or more. Modes above 40 Hz fade by 6 /s and faster, and
     the slowest, at 32 Hz, takes a small part in what is played at 80 Hz and above.
     """
-    left = []
-    for before, after in pairwise(played.heard):
-        if after.fading is None or before.phasors is None:
+    residuals = []
+    for loaded, unloaded in pairwise(played.heard):
+        if unloaded.fading is None or loaded.phasors is None:
             continue
-        end = after.fading.samples[after.fading.times >= after.end - 0.02]
-        left.append((end**2).sum(axis=1).mean() / ((np.abs(before.phasors) ** 2).sum() / 2))
-    assert max(left) < 0.05, left
+        end = unloaded.fading.samples[unloaded.fading.times >= unloaded.end - 0.02]
+        residuals.append((end**2).sum(axis=1).mean() / ((np.abs(loaded.phasors) ** 2).sum() / 2))
+    assert max(residuals) < 0.05, residuals
 
 
 def all_is_off_in_the_end(played: Played, truth: Truth) -> None:

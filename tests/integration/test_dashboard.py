@@ -67,8 +67,8 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def gateway(daemon: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProcess]:
     """Its gateway."""
-    with gateway_process(tmp_path_factory.mktemp("gateway"), daemon) as made:
-        yield made
+    with gateway_process(tmp_path_factory.mktemp("gateway"), daemon) as process:
+        yield process
 
 
 @pytest.fixture
@@ -194,16 +194,16 @@ async def test_each_finger_has_its_content_in_a_colour_of_its_own(
             )
             summary = await tab.evaluate("document.querySelector('#summary').textContent")
             for frequency in frequencies:
-                assert re.search(f"{frequency:.0f} Hz (own|mixed), ", summary)
+                assert re.search(f"{frequency:.0f} Hz (differs|mixed), ", summary)
             (first, _), (second, _) = await tab.until(fingers, is_in_own_colours)
             assert first != second
             for number in (2, 3):
                 button = f"#layers button:nth-child({number})"
                 name = await tab.evaluate(f"document.querySelector('{button}').textContent")
-                west = min(era.status().contacts, key=lambda each: each.x_m)
-                own = f"{west.frequency_hz:.0f} Hz" != name
+                west = min(era.status().contacts, key=lambda contact: contact.x_m)
+                differs = f"{west.frequency_hz:.0f} Hz" != name
                 await tab.click(button)
-                await tab.until(fingers, partial(is_brighter_at, own))
+                await tab.until(fingers, partial(is_brighter_at, differs))
             await tab.click("#layers button")
             await tab.until(fingers, is_in_own_colours)
         assert await contacts(era, 0) == []
@@ -220,16 +220,16 @@ def is_in_own_colours(fingers: list[list[list[int]]]) -> bool:
     )
 
 
-def is_brighter_at(own: int, fingers: list[list[list[int]]]) -> bool:
+def is_brighter_at(index: int, fingers: list[list[list[int]]]) -> bool:
     """Whether the ground of one of two fingers is brighter than that of the other."""
     brightness = [sum(ground) for _, ground in fingers]
-    return len(brightness) == 2 and brightness[own] > brightness[1 - own]
+    return len(brightness) == 2 and brightness[index] > brightness[1 - index]
 
 
 async def test_shift_and_click_leaves_fingers_resting(page: Page, era: Client) -> None:
     """Beside a pointer that presses; each until it is clicked so again, or Escape lifts all."""
-    (one, other, third) = await on_plate(page, (0.3, 0.4), (0.7, 0.6), (0.5, 0.8))
-    for place in (one, other):
+    (first, second, third) = await on_plate(page, (0.3, 0.4), (0.7, 0.6), (0.5, 0.8))
+    for place in (first, second):
         for kind in ("mousePressed", "mouseReleased"):
             await page.mouse(kind, *place, shift=True)
     await contacts(era, 2)
@@ -237,8 +237,8 @@ async def test_shift_and_click_leaves_fingers_resting(page: Page, era: Client) -
     assert (await contacts(era, 3))[-1] == pytest.approx((0.5 * LENGTH, 0.2 * WIDTH), abs=1e-3)
     await page.mouse("mouseReleased", *third)
     await contacts(era, 2)
-    await page.mouse("mousePressed", *one, shift=True)
-    await page.mouse("mouseReleased", *one, shift=True)
+    await page.mouse("mousePressed", *first, shift=True)
+    await page.mouse("mouseReleased", *first, shift=True)
     assert await contacts(era, 1) == [pytest.approx((0.7 * LENGTH, 0.4 * WIDTH), abs=1e-3)]
     await page.press("Escape")
     assert await contacts(era, 0) == []
@@ -303,8 +303,8 @@ async def test_mouse_is_a_finger_while_its_button_is_down(page: Page, era: Clien
     await page.mouse("mouseMoved", x, y, button="none")
     assert await contacts(era, 0) == []
     await page.mouse("mousePressed", x, y)
-    ((seen, _),) = await contacts(era, 1)
-    assert seen == pytest.approx(0.25 * LENGTH, abs=1e-3)
+    ((position, _),) = await contacts(era, 1)
+    assert position == pytest.approx(0.25 * LENGTH, abs=1e-3)
     await page.mouse("mouseMoved", x + 2000, y)  # dragged off the plate: at its edge
     await until_last(era, lambda x: x > LENGTH - 1e-3)
     await page.mouse("mouseReleased", x + 2000, y)
@@ -347,7 +347,9 @@ async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> Non
 
     An empty plate says what to do first, and what this page did is said to be its own.
     """
-    hint, cause = (f"document.querySelector('{each}').innerText" for each in ("#hint", "#cause"))
+    hint, cause = (
+        f"document.querySelector('{element}').innerText" for element in ("#hint", "#cause")
+    )
     enabled = (
         "['arm', 'disarm', 'clear', 'stop'].filter(id => !document.getElementById(id).disabled)"
     )
@@ -407,7 +409,7 @@ async def test_text_has_enough_contrast(page: Page, era: Client, is_dark: bool) 
         await page.until(f"{STATE} === '{state}'")
         ratios = await page.evaluate(f"({PROBES}).contrasts()")
         looked += len(ratios)
-        assert [each for each in ratios if each[0] < 4.5] == []
+        assert [ratio for ratio in ratios if ratio[0] < 4.5] == []
     assert looked > 60
 
 
@@ -489,7 +491,7 @@ async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: 
             " slider.value = -6; slider.dispatchEvent(new Event('input')); })"
         )
         await asyncio.to_thread(wait_for, lambda: era.status().strengths["page"] == -6)
-        kept = await page.evaluate(
+        touches = await page.evaluate(
             "import('./connection.js').then(({ Connection }) => new Promise((done) => {"
             " const token = sessionStorage.getItem('era-haptics-token');"
             " const opened = () => seat.strength('seat 1', NaN).catch((error) =>"
@@ -497,7 +499,7 @@ async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: 
             " const seat = new Connection(token, ['state'], { opened }, undefined, 'seat 1');"
             " }))"
         )
-        assert kept == "gain_db must be a finite number, got NaN"
+        assert touches == "gain_db must be a finite number, got NaN"
         assert era.status().strengths["seat 1"] == -3
         for name in ("page", "seat 1"):
             era.strength(name=name, gain_db=0)
@@ -522,7 +524,7 @@ async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
 
     Of readings those are shown that are known, with their unit, and below 10 with their decimals.
     """
-    shown = await page.evaluate(
+    labels = await page.evaluate(
         "import('./side.js').then(({ showAmplifiers }) => {"
         " const unknown = { state: null, fault: null, levels: [], high_voltage: null,"
         "  reply_age_s: 1 };"
@@ -536,7 +538,7 @@ async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
         "})"
     )
     unknown = ("channels: unknown", "unknown")
-    assert shown == [
+    assert labels == [
         ["tile bad", "left", "no link", *unknown, "72 rpm", "1 s ago"],
         ["tile", "right", "closed: another amplifier is lost", *unknown, "1 s ago"],
     ]
@@ -547,12 +549,12 @@ async def test_login_needs_the_token(tab: Page, gateway: GatewayProcess, era: Cl
     await tab.show(gateway.url)
     await tab.until("!document.querySelector('#login').hidden")
     assert await tab.evaluate("document.querySelector('#main').hidden") is True
-    for token, shown in (("wrong" * 5, "#login-problem"), (TOKEN, "#main")):
+    for token, selector in (("wrong" * 5, "#login-problem"), (TOKEN, "#main")):
         await tab.evaluate(
             f"document.querySelector('#token').value = '{token}';"
             "setTimeout(() => document.querySelector('#login button').click()); 1"
         )
-        if shown == "#main":
+        if selector == "#main":
             await tab.until("document.querySelector('#main')?.hidden === false")
         else:
             await tab.until("document.querySelector('#login-problem')?.innerText")

@@ -149,13 +149,15 @@ async def test_sixteen_channels_of_four_amplifiers_start_together(arranged: str)
         touch(four)
         await four.hold(0.3)
         levels = four.levels()
-        assert {name: len(each) for name, each in levels.items()} == dict.fromkeys(NAMES, 4)
-        for each in levels.values():
-            assert each == pytest.approx((LEVEL,) * 4, abs=1e-4)
+        assert {
+            name: len(channel_levels) for name, channel_levels in levels.items()
+        } == dict.fromkeys(NAMES, 4)
+        for channel_levels in levels.values():
+            assert channel_levels == pytest.approx((LEVEL,) * 4, abs=1e-4)
         starts = [
             voice.transition.start
-            for each in four.far.bench.amplifiers.values()
-            for voices in each.outputs
+            for channel_levels in four.far.bench.amplifiers.values()
+            for voices in channel_levels.outputs
             for voice in voices
             if voice.transition.last
         ]
@@ -175,18 +177,24 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
     async with four_amplifiers(ARRANGED[arranged]) as four:
         touch(four)
         await four.hold(0.3)
-        assert all(level > 0 for each in four.levels().values() for level in each)
+        assert all(
+            level > 0 for channel_levels in four.levels().values() for level in channel_levels
+        )
         four.host_rules.disturb()
         four.far.devices[lost].inject_fault(FaultWindow(fault="hang"))
         holding = asyncio.create_task(four.hold(0.6))
         await asyncio.sleep(OWN)
         assert not any(four.levels()[lost])
         await asyncio.sleep(ALL - OWN)
-        assert not any(level for each in four.levels().values() for level in each)
+        assert not any(
+            level for channel_levels in four.levels().values() for level in channel_levels
+        )
         assert four.controller.group.state is GroupState.LOST
         four.far.devices[lost].recover()
         await holding
-        assert not any(level for each in four.levels().values() for level in each)
+        assert not any(
+            level for channel_levels in four.levels().values() for level in channel_levels
+        )
 
 
 @pytest.mark.parametrize("of_rig", [False, True])
@@ -248,9 +256,9 @@ async def test_command_reaches_it(wire: str, action: Callable[[str], Awaitable[A
     async with far_side(WIRES[wire], RIG) as far:
         far.machine.boots = 5.0
         began = threads.now()
-        found = await action(far.url)
+        result = await action(far.url)
         assert threads.now() - began < 7.0
-        assert found.get("silence", "confirmed_silent") == "confirmed_silent"
+        assert result.get("silence", "confirmed_silent") == "confirmed_silent"
 
 
 @pytest.mark.parametrize(("wire", "told_after"), [("serial", 6.0), ("modbus+tcp", 1.5)])
@@ -260,10 +268,10 @@ async def test_mute_amplifier_is_told_after_a_time(wire: str, told_after: float)
     async with far_side(WIRES[wire], RIG) as far:
         far.device.inject_fault(FaultWindow(fault="hang"))
         began = threads.now()
-        with pytest.raises(LinkTimeout) as told:
+        with pytest.raises(LinkTimeout) as caught:
             await actions.identify_amplifier(far.url)
         assert threads.now() - began == pytest.approx(told_after, abs=0.6)
-        assert ("restarts" in str(told.value)) is (wire == "serial")
+        assert ("restarts" in str(caught.value)) is (wire == "serial")
 
 
 DESKTOP = SCREENS[0]
@@ -286,7 +294,7 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             await open_dashboard(tab, gateway, DESKTOP)
             # Disarmed: no watchdog can make it another fault on a busy machine.
             assert "%" in await tab.until(TILE)
-            before = (await tab.evaluate(EVENTS))[
+            earlier_events = (await tab.evaluate(EVENTS))[
                 -1:
             ]  # a short loss on a busy machine joins this one
             bench.far.device.inject_fault(FaultWindow(fault="hang"))
@@ -299,12 +307,12 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             assert "°C" not in tile
             assert await tab.evaluate("document.querySelector('.plate.unknown') !== null")
             ratios = await tab.evaluate(f"({PROBES}).contrasts()")
-            assert [each for each in ratios if each[0] < 4.5] == []
+            assert [ratio for ratio in ratios if ratio[0] < 4.5] == []
             await tab.until(f"{NOTES} > 1")
-            assert (await tab.evaluate(EVENTS))[1:] == before
+            assert (await tab.evaluate(EVENTS))[1:] == earlier_events
             bench.far.device.recover()
             await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-            assert (await tab.evaluate(EVENTS))[1:] == before
+            assert (await tab.evaluate(EVENTS))[1:] == earlier_events
             assert await tab.evaluate(f"{NOTES} === 1")
             assert await tab.evaluate(REASON) == "simulated"
             await tab.until("document.querySelector('.tile.bad') === null")
@@ -342,9 +350,9 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
         await tab.until("document.querySelector('#summary').textContent.includes('18 dB SL')")
         daemon.silence = UNCONFIRMED
         await tab.click("#stop")
-        shown = await tab.until(problem, lambda text: "side" in text)
-        assert "main" not in shown
-        assert shown in (await tab.evaluate(EVENTS))[0]
+        report = await tab.until(problem, lambda text: "side" in text)
+        assert "main" not in report
+        assert report in (await tab.evaluate(EVENTS))[0]
         daemon.silence = {}
         await tab.click("#stop")
         await tab.until(f"{problem} === ''")
@@ -366,10 +374,10 @@ async def test_page_connects_again_and_reports_a_stop_without_an_answer(
     """
     busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
-        with contextlib.ExitStack() as others:
+        with contextlib.ExitStack() as connections:
             for _ in range(MAX_SESSIONS):
                 last = RawWebSocket(gateway).connection
-                others.callback(last.close)
+                connections.callback(last.close)
             await tab.show(f"{gateway.url}#token={gateway.token}")
             await tab.until(f"{REASON} === 'gateway-full'")
             last.close()
@@ -431,9 +439,9 @@ def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
     start_far_end = controller.demo.simulated_plate.start_simulation
     monkeypatch.setattr(controller.demo.simulated_plate, "start_simulation", start)
     monkeypatch.setattr(controller.demo.demonstration, "TouchRecorder", killing)
-    status, out, said = demo("--real-time", "--touches", capture)
-    assert status == 3, said
-    assert len(said.strip().split("\n\n")) == 1
+    status, out, errors = demo("--real-time", "--touches", capture)
+    assert status == 3, errors
+    assert len(errors.strip().split("\n\n")) == 1
     assert out == ""
 
 
@@ -532,11 +540,11 @@ def watched(daemon: Path) -> Iterator[None]:
 @pytest.fixture
 def gateway(watched: None, daemon: Path, tmp_path: Path) -> Iterator[GatewayProcess]:
     """A gateway, which must not log anything."""
-    with gateway_process(tmp_path, daemon) as made:
-        wait_for_daemon(made)
-        yield made
-        if made.process.poll() is None:
-            assert made.log() == ""
+    with gateway_process(tmp_path, daemon) as process:
+        wait_for_daemon(process)
+        yield process
+        if process.process.poll() is None:
+            assert process.log() == ""
 
 
 def assert_served(gateway: GatewayProcess) -> None:
@@ -554,7 +562,7 @@ def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayPro
     with contextlib.ExitStack() as held:
         silent = [held.enter_context(gateway.connect()) for _ in range(2000)]
         assert_served(gateway)
-        wait_for(lambda: sum(not has_ended(each) for each in silent) <= 128)
+        wait_for(lambda: sum(not has_ended(connection) for connection in silent) <= 128)
         assert_served(gateway)
 
 
@@ -566,7 +574,7 @@ def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: Gateway
     page = f"GET /app.js HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
     hello = frame(b'{"jsonrpc":"2.0","id":1,"method":"hello","params":{"client":"me"}}')
     with contextlib.ExitStack() as held:
-        left: list[tuple[socket.socket, bytes]] = []
+        remaining: list[tuple[socket.socket, bytes]] = []
         for begun in (
             head,
             f"{full}Content-Length: 100\r\n\r\n",
@@ -576,27 +584,27 @@ def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: Gateway
         ):
             slow = held.enter_context(gateway.connect())
             slow.sendall(begun.encode())
-            left.append((slow, b"1"))
+            remaining.append((slow, b"1"))
         for number in range(20):
             deaf = held.enter_context(socket.socket())
             deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
             deaf.connect(("127.0.0.1", gateway.port))
             if number % 2:
                 deaf.sendall(upgrade(gateway))
-            left.append((deaf, 20 * (hello if number % 2 else page)))
+            remaining.append((deaf, 20 * (hello if number % 2 else page)))
         assert_served(gateway)
         end = time.monotonic() + PATIENCE
-        while left:
-            assert time.monotonic() < end, f"{len(left)} are still there"
-            for each in list(left):
-                connection, more = each
+        while remaining:
+            assert time.monotonic() < end, f"{len(remaining)} are still there"
+            for entry in list(remaining):
+                connection, data = entry
                 connection.setblocking(False)
                 try:
-                    connection.send(more)
+                    connection.send(data)
                 except BlockingIOError:
                     pass
                 except ConnectionError:
-                    left.remove(each)
+                    remaining.remove(entry)
             time.sleep(0.1)
         assert_served(gateway)
 

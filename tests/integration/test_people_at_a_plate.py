@@ -105,8 +105,12 @@ async def test_everyone_at_an_example_feels_their_own(
                 contacts, frequencies = [], []
                 async with holding(era, *people), asyncio.timeout(PATIENCE):
                     # until every finger feels a content at nearly its level of 20 dB SL
-                    while not contacts or any((each.level_db_sl or 0) < 17 for each in contacts):
-                        contacts = sorted((await era.status()).contacts, key=lambda each: each.id)
+                    while not contacts or any(
+                        (contact.level_db_sl or 0) < 17 for contact in contacts
+                    ):
+                        contacts = sorted(
+                            (await era.status()).contacts, key=lambda contact: contact.id
+                        )
                 assert len(contacts) == len(people)
                 for contact, (low, high) in zip(contacts, people.values(), strict=True):
                     assert contact.verdict in ("own", "mixed")
@@ -114,7 +118,7 @@ async def test_everyone_at_an_example_feels_their_own(
                     assert low <= contact.frequency_hz <= high
                     frequencies.append(contact.frequency_hz)
                 pairs = combinations(frequencies, 2)
-                assert all(abs(one - other) >= 30 for one, other in pairs)
+                assert all(abs(first - second) >= 30 for first, second in pairs)
                 await era.subscribe("silence")
                 await era.touch([])
                 await next_event(era, "silence")
@@ -136,10 +140,10 @@ async def test_time_of_every_touch_holds_a_delay_of_the_daemon(is_two: bool) -> 
     """
     program = (sys.executable, "-m", "benchmarks.latency.planted", PLANTED)
     async with daemon_session("paper_plate", program=program, is_two=is_two) as session:
-        found = await taps(session, COUNT, is_two=is_two)
-    assert found.unanswered == 0
-    assert found.times.min() > PLANTED
-    assert found.times.min() > found.wire > 0
+        measured = await taps(session, COUNT, is_two=is_two)
+    assert measured.unanswered == 0
+    assert measured.times.min() > PLANTED
+    assert measured.times.min() > measured.wire > 0
 
 
 @pytest.mark.long
@@ -147,9 +151,9 @@ async def test_time_of_every_touch_holds_a_delay_of_the_daemon(is_two: bool) -> 
 async def test_baseline_answers_every_touch() -> None:
     """Plain asyncio, which computes nothing, on the same line."""
     async with plain_session("paper_plate") as session:
-        found = await taps(session, COUNT)
-    assert found.unanswered == 0
-    assert 0 < found.times.min() < found.times.max()
+        measured = await taps(session, COUNT)
+    assert measured.unanswered == 0
+    assert 0 < measured.times.min() < measured.times.max()
 
 
 CHANNELS = 4
@@ -227,8 +231,8 @@ async def stop_by_new_client(daemon: DaemonProcess) -> None:
     async with asyncio.timeout(PATIENCE):
         while True:
             try:
-                async with await daemon.client() as other:
-                    await other.stop()
+                async with await daemon.client() as new_client:
+                    await new_client.stop()
                     break
             except (RpcError, Unreachable, ConnectionError):  # too many clients
                 await asyncio.sleep(0.05)
@@ -240,7 +244,7 @@ async def stop_by_new_client(daemon: DaemonProcess) -> None:
 async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -> None:
     """With 2000 idle and 10 unreading ones memory is bounded, and a new client can stop it."""
     async with playing_daemon(tmp_path) as (daemon, era, journal):
-        before = resident(daemon.process.pid)
+        memory = resident(daemon.process.pid)
         async with (
             flood("unreading", daemon.socket, 10),
             flood("idle", daemon.socket, 2000) as idle,
@@ -249,7 +253,7 @@ async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -
             assert int(await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)) == 2000
             await plays_on("2000 idle, 10 unreading", daemon, era, journal)
             await stop_by_new_client(daemon)
-            assert resident(daemon.process.pid) - before < MAX_GROWTH
+            assert resident(daemon.process.pid) - memory < MAX_GROWTH
         await play(era, daemon.far)
 
 
@@ -275,12 +279,12 @@ async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: 
 async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> None:
     """With malformed or endless requests any client can stop it, and the log stays short."""
     async with playing_daemon(tmp_path) as (daemon, era, journal):
-        before = resident(daemon.process.pid)
+        memory = resident(daemon.process.pid)
         async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
             await plays_on(f"clients flood: {kind}", daemon, era, journal)
             await stop_by_new_client(daemon)
         await play(era, daemon.far)
-        assert resident(daemon.process.pid) - before < MAX_GROWTH
+        assert resident(daemon.process.pid) - memory < MAX_GROWTH
         assert not daemon.has_logged("Traceback")
         assert not daemon.has_logged("no json")
         assert len(daemon.log) < 200  # invalid requests do not fill the disk
@@ -355,14 +359,14 @@ async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
         async with holding(era, far=bench.far):
             good = config.read_text("utf-8")
             config.write_text(f"{good}dashboard: 127.0.0.1:1\n", encoding="utf-8")
-            invalid = [each.values[0] for each in INVALID if each.values[0] is not None]
+            invalid = [case.values[0] for case in INVALID if case.values[0] is not None]
             invalid = invalid[:: 1 if is_every_one else 3]
             for content in invalid:
                 layout.write_bytes(content)
                 await bench.daemon.reload()
-            rejected = [one for one in caplog.messages if "reload rejected" in one]
+            rejected = [message for message in caplog.messages if "reload rejected" in message]
             assert len(rejected) == len(invalid)
-            assert not any("reload failed" in one for one in caplog.messages)
+            assert not any("reload failed" in message for message in caplog.messages)
             assert await era.effects() == effects
             assert any(bench.far.summary().levels)
         status = await era.status()
@@ -398,8 +402,8 @@ def test_finger_feels_what_many_eras_promise(name: str, tmp_path: Path) -> None:
     assert row.steady
     assert row.measured_contrast_db >= row.promised_contrast_db > 6
     (quiet,) = row.quiet
-    shown = row.levels_db_sl[row.target_id] - row.levels_db_sl[quiet]
-    assert shown == pytest.approx(row.measured_contrast_db)
+    contrast = row.levels_db_sl[row.target_id] - row.levels_db_sl[quiet]
+    assert contrast == pytest.approx(row.measured_contrast_db)
     assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
 
 
@@ -415,9 +419,9 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
     scene = example_scenes(rig)[-1]
     demo = run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None)
     rows = run_virtual(demo).rows
-    slid, stayed, left = rows
+    slid, stayed, third = rows
     assert len(slid.fingers) == 3
-    assert slid.fingers == stayed.fingers == left.fingers
+    assert slid.fingers == stayed.fingers == third.fingers
     for row, finger in zip(rows, slid.fingers, strict=True):
         assert row.measured_contrast_db == finger.measured_contrast_db
         assert row.targets_m == [finger.at_m]
@@ -443,7 +447,9 @@ def test_layout_lies_on_its_plate(name: str) -> None:
         x, y = region.shape.center
         assert 0 < x < plate.length
         assert 0 < y < plate.width
-        assert [each.name for each in regions if each.shape.contains(x, y)] == [region.name]
+        assert [candidate.name for candidate in regions if candidate.shape.contains(x, y)] == [
+            region.name
+        ]
 
 
 FOLDER = Path(__file__).parents[2] / "examples" / "application"
@@ -493,23 +499,23 @@ def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path, until
         def until_said(start: str) -> None:
             until(lambda: window.state.text().startswith(start))
 
-        left, at = Qt.MouseButton.LeftButton, QPoint(100, 150)  # of 400 by 300
+        button, at = Qt.MouseButton.LeftButton, QPoint(100, 150)  # of 400 by 300
         until_said("no connection: the daemon does not respond")
         with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
             until_said("ready: ")
-            QTest.mouseClick(window.arm, left)
+            QTest.mouseClick(window.arm, button)
             until_said("on: armed by 'my application'")
             until(lambda: era.status().state == "OPERATION_ENABLED")
             refused: list[str] = []
             window.plate.refused.connect(refused.append)
-            QTest.mouseClick(window.arm, left)  # the lease is kept
-            until(lambda: any(each.startswith("armed by") for each in refused))
-            QTest.mousePress(window.surface, left, pos=at)
+            QTest.mouseClick(window.arm, button)  # the lease is kept
+            until(lambda: any(refusal.startswith("armed by") for refusal in refused))
+            QTest.mousePress(window.surface, button, pos=at)
             until(lambda: window.felt.text().startswith("played by "))
             rig = era.hello("test").rig
-            found: list[Any] = []
-            until(lambda: found.extend(era.status().contacts) or found)  # repeated by its timer
-            contact = found[0]
+            widgets: list[Any] = []
+            until(lambda: widgets.extend(era.status().contacts) or widgets)  # repeated by its timer
+            contact = widgets[0]
             assert contact.x_m == pytest.approx(rig.length_m / 4, abs=1e-3)
             assert contact.y_m == pytest.approx(rig.width_m / 2, abs=1e-3)
             until(lambda: (era.status().lease_left_s or 0) < 4.2)
@@ -523,9 +529,9 @@ def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path, until
             until_said("no connection: ")
             gateway.process.send_signal(signal.SIGCONT)
             until_said("ready: ")
-            QTest.mouseRelease(window.surface, left, pos=at)
+            QTest.mouseRelease(window.surface, button, pos=at)
             until(lambda: not era.status().contacts)
-            QTest.mouseClick(window.stop, left)
+            QTest.mouseClick(window.stop, button)
             until_said("stopped: ")
             assert era.status().state == "QUICK_STOP_ACTIVE"
 
@@ -547,26 +553,26 @@ def test_application_without_its_user_or_connection_lifts_and_disarms(
     ):
         era.subscribe("state")
         window = Window(Plate(gateway.url, TOKEN, ["state", "pattern", "silence"]))
-        left = Qt.MouseButton.LeftButton
+        button = Qt.MouseButton.LeftButton
 
         def disarm() -> None:
             window.plate.socket.abort()
-            QTest.mouseClick(window.disarm, left)
+            QTest.mouseClick(window.disarm, button)
 
         for leave in (window.hide, disarm, window.close):
             window.show()
             until(lambda: window.state.text().startswith("ready: "))
-            QTest.mouseClick(window.arm, left)
+            QTest.mouseClick(window.arm, button)
             until(lambda: era.status().armed_by is not None)
             until(lambda: window.state.text().startswith("on: "))
             if leave is not disarm:
-                QTest.mousePress(window.surface, left, pos=QPoint(100, 150))
+                QTest.mousePress(window.surface, button, pos=QPoint(100, 150))
                 until(lambda: len(era.status().contacts) == 1)
             leave()
             until(lambda: era.status().armed_by is None and not era.status().contacts)
-            causes = [each.data["cause"] for each in era.events(timeout=0.1)]
+            causes = [event.data["cause"] for event in era.events(timeout=0.1)]
             assert "the arming lease was not renewed" not in causes
-            QTest.mouseRelease(window.surface, left, pos=QPoint(100, 150))
+            QTest.mouseRelease(window.surface, button, pos=QPoint(100, 150))
 
 
 SEED, DESK_MESH = 3, "6x4 Q3"
@@ -616,12 +622,12 @@ def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
 
     Stiffness and damping to some percent, as one plate shows.
     """
-    found = session(seed=SEED, touched=2)
-    assert found.held_out_error < 0.05
-    for error in found.calibrated:
+    results = session(seed=SEED, touched=2)
+    assert results.held_out_error < 0.05
+    for error in results.calibrated:
         assert abs(error.size) < 0.1, error
-    for error in found.identified:
+    for error in results.identified:
         limit = 1e-3 if error.kind == "place" else 0.1
         assert abs(error.size) < limit, error
-    assert len(found.touches) == 2
-    assert all(touch.measured_db > 6 for touch in found.touches)
+    assert len(results.touches) == 2
+    assert all(touch.measured_db > 6 for touch in results.touches)

@@ -66,7 +66,7 @@ SLOWEST = (
     "test_table_commands.py",
     "test_stimulus.py",
     "test_draws.py",
-    "test_operation.py",
+    "test_supervisor.py",
     "test_planted_faults.py",
     "test_people_at_a_plate.py",
     "test_house.py",

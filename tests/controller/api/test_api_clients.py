@@ -61,9 +61,9 @@ async def test_client_plays_and_receives_events(tmp_path: Path) -> None:
                 era.unsubscribe("pattern")
                 return [event.topic for event in era.events(timeout=0.2)]
 
-        seen = await asyncio.to_thread(study)
-        assert "pattern" in seen
-        assert seen.count("state") >= 5  # at first, then on, enabled, off and ready
+        topics = await asyncio.to_thread(study)
+        assert "pattern" in topics
+        assert topics.count("state") >= 5  # at first, then on, enabled, off and ready
 
 
 @in_virtual_time
@@ -122,11 +122,11 @@ async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(
 ) -> None:
     """Another client stops: both clients raise, with the cause, except for `stop`."""
     loop = asyncio.get_running_loop()
-    async with ready_daemon(tmp_path) as (bench, other):
+    async with ready_daemon(tmp_path) as (bench, stopping_client):
 
         def study() -> None:
             with Client.connect(bench.socket) as era, era.armed("study", lease_s=60):
-                asyncio.run_coroutine_threadsafe(other.stop(), loop).result()
+                asyncio.run_coroutine_threadsafe(stopping_client.stop(), loop).result()
                 end = time.monotonic() + 15  # s; less than a third of the lease
                 with contextlib.suppress(LeaseLost):
                     while time.monotonic() < end and era.status():
@@ -137,17 +137,17 @@ async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(
 
         async def async_study(error: Exception | None = None) -> None:
             async with await bench.client() as era, era.armed("me", lease_s=1):
-                await other.stop()
+                await stopping_client.stop()
                 if error is not None:
                     raise error
 
         with pytest.raises(LeaseLost, match="stopped by"):
             await asyncio.to_thread(study)
-        await other.status()  # the study has stopped, too
-        await other.clear()
+        await stopping_client.status()  # the study has stopped, too
+        await stopping_client.clear()
         with pytest.raises(LeaseLost, match="stopped by"):
             await async_study()
-        await other.clear()
+        await stopping_client.clear()
         with pytest.raises(KeyError):  # the study's own error has priority
             await async_study(KeyError())
 
@@ -170,7 +170,7 @@ async def test_client_raises_when_the_daemon_has_ended(tmp_path: Path) -> None:
 @in_virtual_time
 async def test_events_that_a_client_is_too_slow_for_are_counted(tmp_path: Path) -> None:
     """Dropped by the daemon, or by the client as they were not taken: each event is had or lost."""
-    async with ready_daemon(tmp_path) as (bench, other), await bench.client() as era:
+    async with ready_daemon(tmp_path) as (bench, observer), await bench.client() as era:
         await era.subscribe("log")
         hub = bench.daemon.publisher.hub
         line = LogEvent(level="info", message="x" * 900, cause=None, remedy=None)
@@ -182,8 +182,8 @@ async def test_events_that_a_client_is_too_slow_for_are_counted(tmp_path: Path) 
         while (event := await era.next_event(timeout=0.1)) is not None:
             events.append(event)
         assert len(events) == MAX_QUEUED_EVENTS
-        assert len(events) + sum(each.lost for each in events) == 3001
-        assert 0 < (await other.status()).lost_events["log"] < 1000
+        assert len(events) + sum(received.lost for received in events) == 3001
+        assert 0 < (await observer.status()).lost_events["log"] < 1000
 
 
 async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Path) -> None:
@@ -194,14 +194,14 @@ async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Pa
             writer.write(request("hello", '{"client":"a"}', id=1))
             writer.write(request("subscribe", '{"topics":["state"]}', id=2))
             lines = [json.loads(await reader.readline()) for _ in range(3)]
-        assert [each.get("id") for each in lines] == [1, 2, None]
+        assert [message.get("id") for message in lines] == [1, 2, None]
         assert lines[2]["params"]["data"]["new"] == READY
 
 
 async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The Python lines of docs/reference/api.md, with the socket at its default path."""
-    found = re.search(r"## In Python\n\n((?:    .*\n|\n)+)", PAGE.read_text("utf-8"))
-    code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)
+    section = re.search(r"## In Python\n\n((?:    .*\n|\n)+)", PAGE.read_text("utf-8"))
+    code = re.sub(r"^    ", "", section[1], flags=re.MULTILINE)
     async with running_daemon(tmp_path) as bench:
         monkeypatch.setattr("controller.api.client.find_socket", lambda path: bench.socket)
         async with await bench.client() as era:
@@ -214,8 +214,8 @@ HELLO = b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"1.0"}}\n'
 
 
 @contextlib.contextmanager
-def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[list[bytes]]:
-    """A server that answers each client's requests in turn, then closes, or repeats the rest.
+def responding(path: Path, *answers: bytes, stream: bytes = b"") -> Iterator[list[bytes]]:
+    """A server that answers each client's requests in turn, then closes, or repeats a stream.
 
     Yields the requests.
     """
@@ -229,8 +229,8 @@ def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[list[
                 for answer in answers or [b""]:
                     received.append(client.recv(1000))
                     client.sendall(answer)
-                while rest:
-                    client.sendall(rest)
+                while stream:
+                    client.sendall(stream)
                     time.sleep(0.01)
 
         def respond() -> None:
@@ -271,12 +271,14 @@ async def test_connect_fails_when_the_peer_is_no_compatible_daemon(
     An error without an id is raised as sent by a daemon with too many clients before it reads
     anything.
     """
-    with responding(tmp_path / "a", line), pytest.raises(error, match=words) as one:
+    with responding(tmp_path / "a", line), pytest.raises(error, match=words) as blocking:
         await asyncio.to_thread(Client.connect, tmp_path / "a")
-    with responding(tmp_path / "b", line), pytest.raises(error, match=words) as other:
+    with responding(tmp_path / "b", line), pytest.raises(error, match=words) as asynchronous:
         await AsyncClient.connect(tmp_path / "b")
     if error is RpcError:
-        assert {getattr(each.value, "code", None) for each in (one, other)} == {ErrorCode.BUSY}
+        assert {getattr(caught.value, "code", None) for caught in (blocking, asynchronous)} == {
+            ErrorCode.BUSY
+        }
 
 
 @pytest.mark.parametrize(
@@ -353,7 +355,7 @@ def test_calls_end_within_the_timeout(tmp_path: Path) -> None:
         server.listen()
         with pytest.raises(Unreachable, match="see its log"):
             Client.connect(tmp_path / "s", timeout=0.05)
-    with responding(tmp_path / "t", HELLO, rest=event):
+    with responding(tmp_path / "t", HELLO, stream=event):
         with Client.connect(tmp_path / "t", timeout=0.2) as era:
             for call in (era.stop, era.status):
                 with pytest.raises(Unreachable, match="does not respond"):
@@ -397,12 +399,14 @@ def test_peer_is_believed_only_as_root_caller_or_service(
 ) -> None:
     """Folder, socket and process have one owner, who is one of the three."""
     users = {"/run/x": folder, "/run/x/era.sock": file}
-    found = dict.fromkeys(("st_mode", "st_ino"), 0)
+    other_fields = dict.fromkeys(("st_mode", "st_ino"), 0)
     credentials = struct.pack("3i", 4711, process, process)
     connected = cast(socket.socket, SimpleNamespace(getsockopt=lambda *_: credentials))
     expected = contextlib.nullcontext() if is_trusted else pytest.raises(Unreachable, match="ERA_")
     with pytest.MonkeyPatch.context() as patch, expected:  # pytest itself reports by Path.stat
-        patch.setattr(Path, "stat", lambda path: SimpleNamespace(st_uid=users[str(path)], **found))
+        patch.setattr(
+            Path, "stat", lambda path: SimpleNamespace(st_uid=users[str(path)], **other_fields)
+        )
         patch.setattr("os.geteuid", lambda: 1000)
         patch.setattr("pwd.getpwnam", lambda name: SimpleNamespace(pw_uid={"plate": 990}[name]))
         check_peer(Path("/run/x/era.sock"), connected, environment={"ERA_HAPTICS_USER": "plate"})

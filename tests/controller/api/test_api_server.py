@@ -1,570 +1,108 @@
-"""The API's server: refusals, the order of service, which touches count, and its connections.
+"""The API's server: the order in which clients are served, their places and their bounds.
 
-Their bounds, to the byte and the request, their turns, counted in requests, and daemons of a later
-version; in virtual time.
+Clients and server are in memory and in virtual time, which stands still while lines are served.
 """
 
 import asyncio
-import contextlib
 import json
-import re
 import socket
-from collections import Counter
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Any, cast
+from typing import Final
 from unittest.mock import Mock
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from controller.api import server
-from controller.api.client import AsyncClient, Client
-from controller.api.hub import Hub
-from controller.api.jsonrpc import (
-    ErrorCode,
-    InvalidRequest,
-    RpcError,
-    error_line,
-    read_params,
-    read_request,
-    request_line,
-    result_line,
-)
-from controller.api.methods import (
-    METHODS,
-    TOPICS,
-    ArmParams,
-    ContactsEvent,
-    EventParams,
-    LogEvent,
-    StatusResult,
-    SubscribeParams,
-)
-from controller.api.schema import MAX_RATE, ApiMessage, Empty
-from controller.api.server import MAX_UNREAD_BYTES, ApiServer, Connection
-from controller.gateway.field import DrawnField
+from controller.api.jsonrpc import ErrorCode
+from controller.api.methods import StatusResult
+from controller.api.server import MAX_UNREAD_BYTES, ApiServer
 from kit.api_parameters import API_PARAMETERS
 from kit.clock import feed, in_virtual_time
-from kit.courses import Taken, courses, follow
-from processes.daemons import (
-    PATIENCE,
-    PLACE,
-    ServedApi,
-    Wire,
-    holding,
-    request,
-    running_daemon,
-    serving,
-    until_state,
-)
-from registry import threads
+from processes.daemons import PATIENCE, ServedApi, request, serving
 
-PARAMS = {
-    **{name: json.dumps(API_PARAMETERS[name]) for name in ("arm", "hello", "play", "renew")},
-    "disarm level": '{"level":2}',
-    "effects x": '{"x":1}',
-    "renew stop": '{"lease":"stop"}',
-    "stop x": '{"x":1}',
-    "touch": '{"source":"a","touches":[]}',
-    "touch down": '{"source":"a","touches":[{"id":1,"x_m":0.1,"y_m":0.1}]}',
-}
-"""Parameters of requests by their names, of which the first word is the method."""
+RESULT: Final = "result"
+RATE_LIMIT = 2000
+"""Requests of one client at once."""
+MAX_LINE = 1 << 16
+"""Bytes of a line with its line feed."""
 
 
-def bytes_of(line: str | Mapping[Any, Any]) -> bytes:
-    """A request by its name, so many of a line, or raw bytes."""
-    if isinstance(line, Mapping):
-        ((key, each),) = line.items()
-        return each.encode("latin-1") if key == "raw" else key * bytes_of(each)
-    name, _, id = line.partition(" #")
-    return request(name.split()[0], PARAMS.get(name, "{}"), id=id or None)
+def line(method: str, id: int | None = None) -> bytes:
+    """A request with valid parameters."""
+    return request(method, json.dumps(API_PARAMETERS.get(method, {})), id=id)
 
 
-@dataclass
-class Clients(Taken):
-    """Clients of a server in memory, by their names, and what they do; marked: of the calls."""
+ASKING = line("renew")
+TOUCHING = line("touch")
+WRONG_STOP = request("stop", '{"x":1}')
+WRONG_DISARM = request("disarm", '{"level":2}')
 
-    served: ServedApi = field(init=False)
-    made: dict[str, tuple[Connection, Wire]] = field(default_factory=dict)
-    marked: int = 0
-    patch: pytest.MonkeyPatch = field(default_factory=pytest.MonkeyPatch)
 
-    def __post_init__(self) -> None:
-        """Make the server, which counts time from now on."""
-        began = threads.now()
-        self.served = ServedApi(clock=lambda: threads.now() - began)
+class MemoryClient:
+    """A client of a server in memory, in a process with this id."""
 
-    def of(self, name: str) -> list[tuple[Connection, Wire]]:
-        """The client of a name, or those that differ by a number."""
-        return [each for key, each in self.made.items() if name in (key, key.rpartition(" ")[0])]
-
-    def connects(self, name: str) -> None:
-        """Connect a client."""
-        self.connects_of(1, name)
-
-    def connects_of(self, process: int, name: str) -> None:
-        """Connect a client of a process."""
-        self.made[name] = self.served.client(process=process)
-
-    def connects_many(self, count: int, name: str) -> None:
-        """Connect so many more, whose names end in numbers."""
-        for _ in range(count):
-            self.connects(f"{name} {len(self.made)}")
-
-    def sends(self, name: str, *lines: str | Mapping[Any, Any]) -> None:
-        """Let clients send lines at once."""
-        for client, _ in self.of(name):
-            feed(client, b"".join(map(bytes_of, lines)))
-
-    async def takes(self, name: str, *lines: str | Mapping[Any, Any]) -> None:
-        """Do the same for one after the other, and serve what is to be served at once."""
-        for client, _ in self.of(name):
-            await self.served.takes(client, b"".join(map(bytes_of, lines)))
-
-    async def turns(self, count: int) -> None:
-        """Let the event loop turn so often."""
-        for _ in range(count):
-            await asyncio.sleep(0)
-
-    def hears(self, name: str, *lines: str) -> None:
-        """Require the responses to each of some clients since the last that it read."""
-        for _, wire in self.of(name):
-            found = [
-                f"{json.dumps(each['id'])} {each.get('error', {}).get('code', 'result')}"
-                for each in wire.lines()
-            ]
-            assert found == [*lines]
-
-    def reads(self) -> None:
-        """Let all clients read, and forget, what was sent to them."""
-        for _, wire in self.made.values():
-            wire.waiting = b""
+    def __init__(self, api: ServedApi, *, process: int = 1) -> None:
+        self.api = api
+        self.connection, self.wire = api.client(process=process)
 
     @property
-    def sent(self) -> str:
-        """All that clients have not read yet."""
-        return "".join(wire.waiting.decode() for _, wire in self.made.values())
+    def is_open(self) -> bool:
+        """Whether the server has kept its connection."""
+        return self.connection.is_open
 
-    def results_fail(self) -> None:
-        """Let the result of `status` be one that cannot be sent."""
-        self.patch.setattr(StatusResult, "model_dump_json", Mock(side_effect=UnicodeError))
+    def send(self, *lines: bytes) -> None:
+        """Send lines in one piece."""
+        feed(self.connection, b"".join(lines))
 
-    def ends_its_input(self, name: str) -> None:
-        """Let a client close its side."""
-        self.made[name][0].eof_received()
+    async def ask(self, *lines: bytes) -> None:
+        """Send lines in one piece, and let the server serve what it serves at once."""
+        self.send(*lines)
+        await self.api.settle()
 
-    def leaves(self, name: str) -> None:
-        """Let a client be gone."""
-        client, wire = self.made[name]
-        wire.abort()
-        client.connection_lost(None)
+    def responses(self) -> list[tuple[object, ErrorCode | str]]:
+        """The ids of responses since the last call, with the codes of their errors or RESULT."""
+        pairs = list[tuple[object, ErrorCode | str]]()
+        for response in self.wire.lines():
+            error = response.get("error")
+            outcome = RESULT if error is None else ErrorCode(error["code"])
+            pairs.append((response["id"], outcome))
+        return pairs
 
-    def holds_the_lease(self, name: str) -> None:
-        """Let a client be its holder."""
-        self.served.holder = self.made[name][0]
-
-    def marks(self) -> None:
-        """Look at the calls from now on."""
-        self.marked = len(self.names)
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the methods called."""
-        return self.served.names
-
-    @property
-    def runs(self) -> list[tuple[str, int]]:
-        """Names of calls since the mark, and how often in a row."""
-        return [(name, len([*some])) for name, some in groupby(self.names[self.marked :])]
-
-    @property
-    def open_clients(self) -> Mapping[str, int]:
-        """How many are connected of each name, numbers left out."""
-        names = [name for name, (client, _) in self.made.items() if client.is_open]
-        return Counter(re.sub(r" \d+$", "", name) for name in names)
-
-    @property
-    def in_reserve(self) -> list[str]:
-        """Clients with a place in reserve."""
-        return [name for name, (client, _) in self.made.items() if client.is_reserve]
+    def leave(self) -> None:
+        """Lose the connection."""
+        self.wire.abort()
+        self.connection.connection_lost(None)
 
 
-@asynccontextmanager
-async def clients(*, turn: float = 0.0) -> AsyncIterator[Clients]:
-    """A server without clients; turn [s]: how long one is, none for a line of each client."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(server, "MAX_TURN", turn)
-        found = Clients(patch=patch)
-        yield found
-        found.served.may_arm.set()
-        await found.served.settle()
-
-
-COURSES = courses(Path(__file__).with_name("served.yaml"))
-
-
-@pytest.mark.parametrize("name", COURSES)
-def test_clients_are_served_by_their_course(name: str) -> None:
-    """Every step is as it is in the file."""
-    follow(COURSES[name], clients)
-
-
-async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path) -> None:
-    """However far it has come when the server looks at those that are open."""
-    for iterations in range(6):
-        api = ApiServer({}, on_disconnect=Mock(), holds_lease=lambda client: False)
-        bound = socket.socket(socket.AF_UNIX)
-        bound.bind(str(tmp_path / f"{iterations}.sock"))
-        await api.open(bound)
-        with socket.socket(socket.AF_UNIX) as client:
-            client.connect(str(tmp_path / f"{iterations}.sock"))
-            for _ in range(iterations):
-                await asyncio.sleep(0)
-            await api.close()
-            client.setblocking(False)
-            with suppress(ConnectionResetError):  # it was never accepted
-                async with asyncio.timeout(PATIENCE / 6):
-                    assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
-
-
-@pytest.mark.parametrize(
-    ("where", "is_called"),
-    [("silencing.parse_json", True), ("server.read_params", True), ("the method", False)],
-)
-async def test_server_stops_although_a_stop_fails_on_its_way(
-    monkeypatch: pytest.MonkeyPatch, where: str, is_called: bool
-) -> None:
-    """A bug in reading its line does not keep it from its method; one in the method stops all.
-
-    Its client is not told of success.
-    """
-    served = ServedApi()
-
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("a bug")
-
-    if where == "the method":
-        served.called = fail
-    else:
-        monkeypatch.setattr(f"controller.api.{where}", fail)
-        monkeypatch.setattr("controller.api.server.read_request", fail)
-    client, wire = served.client()
-    await served.takes(client, request("stop", id=1))
-    assert (served.names, served.stops) == (["stop"], 0 if is_called else 1)
-    assert [line["error"]["code"] for line in wire.lines()] == [ErrorCode.INTERNAL]
-
-
-TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
-
-
-def test_request_of_the_specification_is_read() -> None:
-    """The first example with named parameters of the JSON-RPC 2.0 specification.
-
-    A notification lacks the member id; null is an id. Requests of the client have the same id and
-    parameters at the server.
-    """
-    example = read_request(
-        b'{"jsonrpc": "2.0", "method": "subtract", '
-        b'"params": {"subtrahend": 23, "minuend": 42}, "id": 3}'
-    )
-    assert (example.method, example.id, example.expects_response) == ("subtract", 3, True)
-    assert example.params == {"subtrahend": 23, "minuend": 42}
-    for id, expected in (("", False), (',"id":null', True), (',"id":"a"', True)):
-        line = f'{{"jsonrpc":"2.0","method":"stop"{id}}}'.encode()
-        assert read_request(line).expects_response is expected
-    for params in (
-        ArmParams(owner="Zoë", lease_s=5.0),
-        SubscribeParams(topics=["state"], rate_hz=None),
-        SubscribeParams(topics=["amplifiers", "log"], rate_hz=60.0),
-        Empty(),
-    ):
-        written = read_request(
-            request_line(7, "any", params.model_dump_json(exclude_none=True).encode())
-        )
-        assert written.id == 7
-        assert read_params(type(params), written) == params
-
-
-@pytest.mark.parametrize(
-    ("line", "code"),
-    [
-        (b"", ErrorCode.PARSE),
-        (b"hello", ErrorCode.PARSE),
-        (b"\xff\xfe", ErrorCode.PARSE),
-        (b'{"jsonrpc":"2.0","id":1,"method":"stop"', ErrorCode.PARSE),
-        (b'{"jsonrpc":"2.0","id":1,"method":"\\ud800"}', ErrorCode.INVALID_REQUEST),
-        (
-            request("touch", '{"source":"a","touches":[{"id":1,"x_m":NaN,"y_m":0}]}', id=1),
-            ErrorCode.PARSE,
-        ),
-        (request("arm", '{"owner":"me","lease_s":Infinity}', id=1), ErrorCode.PARSE),
-        (b"[" * 60_000, ErrorCode.PARSE),
-        (b"1", ErrorCode.INVALID_REQUEST),
-        (b"[]", ErrorCode.INVALID_REQUEST),
-        (b'[{"jsonrpc":"2.0","id":1,"method":"stop"}]', ErrorCode.INVALID_REQUEST),
-        (b"{}", ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"1.0","id":1,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1,"method":7}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1.5,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":true,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (request("stop", id="1" + "0" * 4000), ErrorCode.INVALID_REQUEST),
-        (request("stop", id=f'"{"i" * 81}"'), ErrorCode.INVALID_REQUEST),
-        (request("stop", "[1]", id=1), ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1,"method":"stop","more":1}', ErrorCode.INVALID_REQUEST),
-    ],
-)
-def test_line_that_is_no_request_is_refused(line: bytes, code: ErrorCode) -> None:
-    """-32700 for invalid JSON, -32600 for JSON that is not one request with named parameters."""
-    with pytest.raises(RpcError) as caught:
-        read_request(line)
-    assert caught.value.code is code
-    assert caught.value.data.remedy
-
-
-@pytest.mark.parametrize(
-    ("line", "id"),
-    [
-        (b'{"jsonrpc":"1.0","id":7,"method":"stop"}', 7),
-        (b'{"id":"a","method":1}', "a"),
-        (b'{"jsonrpc":"2.0","id":7,"method":"stop","method":"arm"}', 7),
-        (b'{"jsonrpc":"2.0","id":7,"method":"stop","params":{"a":1,"a":1}}', 7),
-        (b'{"jsonrpc":"2.0","id":7,"method":"stop","params":{"a":NaN}}', 7),
-        (b'{"jsonrpc":"1.0","id":1.5,"method":"stop"}', None),
-        (b'{"jsonrpc":"2.0","id":7,"method":"stop"', None),
-        (b'[{"id":7}]', None),
-    ],
-)
-def test_invalid_request_is_refused_with_its_id_if_that_can_be_read(
-    line: bytes, id: int | str | None
-) -> None:
-    """JSON that is no request, repeats a key or has NaN; null as JSON-RPC 2.0 has it otherwise."""
-    with pytest.raises(InvalidRequest) as caught:
-        read_request(line)
-    assert caught.value.id == id
-
-
-@pytest.mark.parametrize(
-    ("method", "params", "key"),
-    [
-        ("arm", "{}", "owner"),
-        ("arm", '{"owner":"me","lease_s":0.99}', "lease_s"),
-        ("arm", '{"owner":"me","lease_s":61}', "lease_s"),
-        ("arm", '{"owner":"me","lease_s":"5"}', "lease_s"),
-        ("arm", '{"owner":"me","lease_s":1e999}', "lease_s"),
-        ("arm", '{"owner":"me","lease_s":true}', "lease_s"),
-        ("arm", '{"owner":"","lease_s":5}', "owner"),
-        ("arm", '{"owner":"a\\nb","lease_s":5}', "owner"),
-        ("arm", '{"owner":"a\\u001b[2J","lease_s":5}', "owner"),
-        ("arm", '{"owner":"a\\u009b2J","lease_s":5}', "owner"),
-        ("arm", '{"owner":"a\\u202eb","lease_s":5}', "owner"),
-        ("arm", '{"owner":"me","lease_s":5,"level":2}', "level"),
-        ("stop", '{"file":"/etc/passwd"}', "file"),
-        ("hello", '{"client":"' + "c" * 81 + '"}', "client"),
-        ("touch", '{"source":"a","touches":[{"id":1.5,"x_m":0,"y_m":0}]}', "touches.0.id"),
-        ("touch", '{"source":"a","touches":[{"id":1,"x_m":null,"y_m":0}]}', "touches.0.x_m"),
-        ("touch", '{"source":"a","touches":[{"id":9e99,"x_m":0,"y_m":0}]}', "touches.0.id"),
-        ("touch", f'{{"source":"a","touches":[{",".join([TOUCH] * 65)}]}}', "touches"),
-        ("subscribe", '{"topics":["weather"]}', "topics.0"),
-        ("subscribe", '{"topics":["state"],"rate_hz":61}', "rate_hz"),
-        ("subscribe", '{"topics":[]}', "topics"),
-    ],
-)
-def test_parameter_that_is_wrong_is_refused_with_its_key(
-    method: str, params: str, key: str
-) -> None:
-    """-32602 and the key of what is missing, unknown, of another type or out of range."""
-    with pytest.raises(RpcError) as caught:
-        read_params(METHODS[method].params, read_request(request(method, params, id=1)))
-    assert caught.value.code is ErrorCode.INVALID_PARAMS
-    assert caught.value.data.where == key
-    assert caught.value.data.remedy
-
-
-def test_response_has_the_members_of_the_specification() -> None:
-    """Result and error objects of JSON-RPC 2.0, one line each."""
-    assert json.loads(result_line("a", '{"lease":"x"}')) == {
-        "jsonrpc": "2.0",
-        "id": "a",
-        "result": {"lease": "x"},
-    }
-    error = RpcError(ErrorCode.WRONG_STATE, "the\nplate", where="state", remedy="arm first")
-    line = error_line(None, error)
-    assert line.count(b"\n") == 1
-    assert json.loads(line) == {
-        "jsonrpc": "2.0",
-        "id": None,
-        "error": {
-            "code": 1001,
-            "message": "the\nplate; arm first",
-            "data": {"what": "the\nplate", "where": "state", "remedy": "arm first"},
-        },
-    }
-
-
-@given(st.binary(max_size=200))
-def test_line_of_any_bytes_is_a_request_or_refused(line: bytes) -> None:
-    """Any input gives a request or an RpcError whose response is one line."""
-    response = b"{}\n"
-    try:
-        read_request(line)
-    except RpcError as error:
-        response = error_line(None, error)
-    assert json.loads(response) is not None
-    assert response.index(b"\n") == len(response) - 1
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: (
-        st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=3), inner, max_size=2)
-    ),
-    max_leaves=4,
-)
-
-
-@given(st.sampled_from(sorted(METHODS)), st.dictionaries(st.text(max_size=8), JSON, max_size=4))
-def test_params_of_any_shape_are_valid_or_refused(method: str, params: dict[str, object]) -> None:
-    """Any parameters give a message or an RpcError without control characters."""
-    line = json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params})
-    text = ""
-    try:
-        read_params(METHODS[method].params, read_request(line.encode()))
-    except RpcError as error:
-        text = str(error)
-    assert text == "" or text.isprintable()
-
-
-READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
-# keyed by name, not messages: so many levels deep
-MAPPINGS = {"drive": 1, "layers": 2, "parameters": 1, "layout": 1}
-MAPPINGS |= {"strengths": 1, "rejected_touches": 1, "rejected_examples": 1, "lost_events": 1}
-
-
-def with_extra_keys(content: Any, mapping_depth: int = 0) -> Any:
-    """A message of a later minor version: every object has a further key."""
-    if isinstance(content, list):
-        return [with_extra_keys(each) for each in content]
-    if not isinstance(content, dict):
-        return content
-    if mapping_depth:
-        return {key: with_extra_keys(each, mapping_depth - 1) for key, each in content.items()}
-    later = {key: with_extra_keys(each, MAPPINGS.get(key, 0)) for key, each in content.items()}
-    return later | {"extra": [{"of": "later"}]}
-
-
-async def test_extra_keys_of_a_later_minor_version_are_ignored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In results and notifications at every depth: by both clients and by the gateway."""
-    made = Connection.connection_made
-
-    def speak_later(connection: Connection, transport: Any) -> None:
-        write = transport.write
-        transport.write = lambda line: write(
-            json.dumps(with_extra_keys(json.loads(line))).encode() + b"\n"
-        )
-        made(connection, transport)
-
-    def use(path: Path) -> list[str]:
-        with Client.connect(path) as era:
-            era.subscribe("state")
-            seen = [era.status().state, *(event.topic for event in era.events(timeout=0.2))]
-            era.effects()
-            return seen
-
-    monkeypatch.setattr(Connection, "connection_made", speak_later)
-    async with running_daemon(tmp_path) as bench:
-        async with await AsyncClient.connect(bench.socket) as era:
-            await until_state(era, READY)
-            assert await asyncio.to_thread(use, bench.socket) == [READY, "state"]
-            field = DrawnField(bench.socket)
-            drawing = asyncio.create_task(field.run())
-            frames = field.frames()
-            empty = await anext(frames)
-            await era.subscribe("pattern")
-            async with era.armed("me"), holding(era, PLACE), asyncio.timeout(60):
-                async for event in era.events():
-                    assert "extra" in event.data["contacts"][0]
-                    drives = [event.data["drive"], *event.data["layers"].values()]
-                    assert all("extra" in tone for drive in drives for tone in drive.values())
-                    if event.data["layers"]:
-                        break
-                drawn = empty
-                while len(drawn) == len(empty):
-                    drawn = await anext(frames)
-        drawing.cancel()
-        await asyncio.wait({drawing})
-
-
-@in_virtual_time
-async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
-    """Results and notifications read strictly by the models of the reference page."""
-    down = [{"id": 1, "x_m": PLACE[0], "y_m": PLACE[1]}]
-    topics = sorted(TOPICS.keys() - {"link", "log"})
-    received: set[str] = set()
-
-    async with contextlib.AsyncExitStack() as stack:
-        bench = await stack.enter_async_context(running_daemon(tmp_path))
-        async with await bench.client() as era:
-            await until_state(era, READY)
-        reader, writer = await asyncio.open_unix_connection(bench.socket, limit=1 << 20)
-        stack.callback(writer.close)
-
-        async def next_response() -> dict[str, Any]:
-            """The next response; notifications before it are read strictly."""
-            while True:
-                content: dict[str, Any] = json.loads(await reader.readline())
-                if "method" not in content:
-                    return content
-                event = EventParams.model_validate(content["params"])
-                TOPICS[event.topic].data.model_validate_json(json.dumps(event.data))
-                received.add(event.topic)
-
-        async def call(method: str, **params: object) -> None:
-            request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
-            writer.write(json.dumps(request).encode() + b"\n")
-            response = await next_response()
-            assert response.keys() == {"jsonrpc", "id", "result"}, response
-            METHODS[method].result.model_validate_json(json.dumps(response["result"]))
-
-        async with asyncio.timeout(60):
-            await call("hello", client="me")
-            await call("subscribe", topics=topics, rate_hz=60.0)
-            assert received == set()  # the reply comes before the first event
-            await call("effects")
-            await call("arm", owner="me", lease_s=5.0)
-            for touches, awaited in ((down, "pattern"), ([], "silence")):
-                while awaited not in received:
-                    await call("touch", source="me", touches=touches)
-                    await call("status")
-                    await asyncio.sleep(0.01)
-            await call("stop")
-            await call("clear")
-            while received != set(topics):
-                await call("status")
-                await asyncio.sleep(0.01)
-
-
-REQUEST = request("renew", '{"lease":"a"}')
-
-
-def serve() -> ServedApi:
+def timed_api() -> ServedApi:
     """A server that counts time from now on."""
     loop = asyncio.get_running_loop()
-    began_at = loop.time()
-    return ServedApi(clock=lambda: loop.time() - began_at)
+    start = loop.time()
+    return ServedApi(clock=lambda: loop.time() - start)
 
 
-@pytest.fixture(autouse=True)
-def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End turns by the number of lines, as virtual time stands still meanwhile."""
-    monkeypatch.setattr(server, "MAX_TURN", 0.0)
+def connect(api: ServedApi, count: int) -> list[MemoryClient]:
+    """So many clients."""
+    return [MemoryClient(api) for _ in range(count)]
+
+
+async def ask_in_turn(clients: Sequence[MemoryClient], request_line: bytes) -> None:
+    """Let clients ask one after the other."""
+    for client in clients:
+        await client.ask(request_line)
+
+
+def runs(names: Sequence[str]) -> list[tuple[str, int]]:
+    """Names of calls, with how often each was called in a row."""
+    return [(name, len([*calls])) for name, calls in groupby(names)]
+
+
+def places(clients: Sequence[MemoryClient]) -> int:
+    """How many of them are connected."""
+    return sum(client.is_open for client in clients)
 
 
 async def iterate(count: int) -> None:
@@ -573,149 +111,551 @@ async def iterate(count: int) -> None:
         await asyncio.sleep(0)
 
 
+@pytest.fixture(autouse=True)
+def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End turns by the number of lines, as virtual time stands still meanwhile."""
+    monkeypatch.setattr(server, "MAX_TURN", 0.0)
+
+
+@pytest.fixture
+def long_turns(one_line_a_turn: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Serve all lines of a client in one turn."""
+    monkeypatch.setattr(server, "MAX_TURN", 1.0)
+
+
+@in_virtual_time
+async def test_server_continues_after_invalid_lines() -> None:
+    """Lines that are no JSON, no request, or wrong requests get an error each; the next is served."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await client.ask(
+        b"garbage\n\n\xff\n[]\n",
+        line("no_such_method", 1),
+        request("effects", '{"x":1}', id=2),
+        line("disarm", 9),
+    )
+
+    assert client.responses() == [
+        *[(None, ErrorCode.PARSE)] * 3,
+        (None, ErrorCode.INVALID_REQUEST),
+        (1, ErrorCode.UNKNOWN_METHOD),
+        (2, ErrorCode.INVALID_PARAMS),
+        (9, RESULT),
+    ]
+    assert api.names == ["disarm"]
+
+
+@in_virtual_time
+async def test_server_closes_a_connection_whose_line_exceeds_64_kib() -> None:
+    """65 536 bytes with the line feed are served; a byte more, complete or not, is refused."""
+    api = timed_api()
+    head = b'{"jsonrpc":"2.0","id":1,"method":"layout","params":{"name":"a"}'
+    padding = b" " * (MAX_LINE - len(head) - len(b"}\n"))
+    lines = [head + padding + b"}\n", head + padding + b" }\n", b"x" * MAX_LINE]
+    longest, longer, endless = connect(api, 3)
+
+    for client, text in zip((longest, longer, endless), lines, strict=True):
+        await client.ask(text)
+
+    assert longest.responses() == [(1, RESULT)]
+    assert longer.responses() == [(None, ErrorCode.PARSE)]
+    assert endless.responses() == [(None, ErrorCode.PARSE)]
+    assert [longest.is_open, longer.is_open, endless.is_open] == [True, False, False]
+    assert api.names == ["layout"]
+
+
+@in_virtual_time
+async def test_request_without_id_gets_no_response() -> None:
+    """Not even an error; and nothing is armed, as the lease would be unknown."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await client.ask(line("disarm"), line("no_such_method"), line("arm"))
+
+    assert client.responses() == []
+    assert api.names == ["disarm"]
+
+
+@pytest.mark.parametrize("method", ["stop", "disarm"])
+@pytest.mark.usefixtures("long_turns")
+@in_virtual_time
+async def test_arm_in_the_same_bytes_before_what_silences_is_not_carried_out(method: str) -> None:
+    """The client wants the plate disarmed in the end; the other way round, it is armed."""
+    api = timed_api()
+    api.may_arm.set()
+    client = MemoryClient(api)
+
+    await client.ask(line("arm", 1), line(method, 2))
+    assert api.names == [method]
+    assert client.responses() == [(2, RESULT), (1, ErrorCode.LEASE)]
+
+    await client.ask(line(method, 3), line("arm", 4))
+    assert api.names == [method, method, "arm"]
+
+
+@in_virtual_time
+async def test_stop_and_disarm_are_served_while_requests_are_pending() -> None:
+    """Eight requests may be pending, and further ones are refused; what silences is served."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await client.ask(*[line("arm", id) for id in range(10)])
+    await client.ask(line("disarm", 98), line("stop", 99))
+
+    busy = [(8, ErrorCode.BUSY), (9, ErrorCode.BUSY)]
+    assert client.responses() == [*busy, (98, RESULT), (99, RESULT)]
+    api.may_arm.set()
+    await api.settle()
+    assert client.responses() == [(id, RESULT) for id in range(8)]
+
+
+@in_virtual_time
+async def test_client_that_closed_its_side_gets_pending_responses() -> None:
+    """The connection ends after the responses; an arm is only for a client that stays."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    client.send(line("stop", 1), line("arm", 2))
+    client.connection.eof_received()
+    assert client.is_open
+    await api.settle()
+
+    assert client.responses() == [(1, RESULT), (2, ErrorCode.LEASE)]
+    assert not client.is_open
+    assert api.names == ["stop"]
+
+
+@in_virtual_time
+async def test_stop_is_served_among_silent_and_asking_clients() -> None:
+    """With 160 silent clients after 32 that ask, one of another process gets a place in reserve.
+
+    There it can stop, but not ask for effects until one of the 32 has left.
+    """
+    api = timed_api()
+    asking = connect(api, 32)
+    await ask_in_turn(asking, line("effects", 1))
+    connect(api, 160)
+    client = MemoryClient(api, process=2)
+    in_reserve = ["hello", "status", "stop", "disarm"]
+
+    await client.ask(line("effects", 0), *map(line, in_reserve, range(1, 5)))
+    assert client.responses() == [
+        (0, ErrorCode.BUSY),
+        *[(id, RESULT) for id in range(1, 5)],
+    ]
+
+    asking[0].leave()
+    await client.ask(line("effects", 6))
+    assert client.responses() == [(6, RESULT)]
+
+
+@in_virtual_time
+async def test_client_that_touches_waits_for_no_other_client() -> None:
+    """Its frames go before what 30 clients ask without end, until 150 ms after its last one.
+
+    Every second turn is one of the others all the same.
+    """
+    api = timed_api()
+    touching = MemoryClient(api)
+    touching.send(TOUCHING * 8)
+    asking = connect(api, 30)
+    for client in asking:
+        client.send(ASKING * 100)
+
+    await iterate(40)
+    assert api.names[:15] == ["touch", *["touch", "renew"] * 7]
+    await api.settle()
+    assert len(api.names) == 8 + 30 * 100
+
+    await asyncio.sleep(0.16)
+    api.calls.clear()
+    for client in asking:
+        client.send(ASKING)
+    touching.send(TOUCHING)
+    await api.settle()
+    assert runs(api.names) == [("renew", 30), ("touch", 1)]
+
+
+@in_virtual_time
+async def test_stop_is_carried_out_in_any_number_whatever_is_wrong_with_it() -> None:
+    """6000 at once, beyond the rate of other requests."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await client.ask(WRONG_STOP * 3000, WRONG_DISARM * 3000)
+
+    assert len(api.names) == 6000
+    assert client.is_open
+
+
+@in_virtual_time
+async def test_stop_behind_a_line_that_is_too_long_is_carried_out() -> None:
+    """The touches behind it, too, but no arm; then the connection is closed."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await client.ask(b"x" * MAX_LINE + b"\n", TOUCHING * 20, line("stop"), line("arm"))
+
+    assert runs(api.names) == [("touch", 20), ("stop", 1)]
+    assert not client.is_open
+
+
+async def exceed_the_rate(client: MemoryClient, text: bytes) -> None:
+    """Send a line as often as the rate of requests allows, each read by its client."""
+    for _ in range(RATE_LIMIT):
+        client.wire.waiting = b""
+        await client.ask(text)
+    client.wire.waiting = b""
+
+
+@in_virtual_time
+async def test_disarm_behind_too_many_errors_is_carried_out() -> None:
+    """What else is behind the line that ends the connection is not."""
+    api = timed_api()
+    client = MemoryClient(api)
+    await exceed_the_rate(client, b"{}\n")
+
+    await client.ask(b"{}\n", line("disarm"), ASKING)
+
+    assert api.names == ["disarm"]
+    assert not client.is_open
+
+
+@in_virtual_time
+async def test_stop_of_a_client_that_is_lost_is_carried_out() -> None:
+    """Its client is gone before its turn; what would play is not carried out."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    client.send(TOUCHING * 100, line("stop", 1), line("arm", 2))
+    client.leave()
+    await api.settle()
+
+    assert api.names == ["stop"]
+
+
+@in_virtual_time
+async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
+    """For 3 ms at most if touches follow each other without a gap; otherwise until it is sent."""
+    api = timed_api()
+    client = MemoryClient(api)
+    api.is_busy = True
+    client.send(ASKING * 4)
+
+    await asyncio.sleep(0.0029)
+    assert api.names == []
+    await asyncio.sleep(0.0049)
+    assert api.times("renew") == pytest.approx([0.003, 0.0065], abs=0.001)
+
+    api.is_busy = False
+    await asyncio.sleep(0.0006)
+    assert api.names == ["renew"] * 4
+
+
+@in_virtual_time
+async def test_stop_is_served_at_once_though_touches_come_first() -> None:
+    """Also behind other requests of its client, and in two parts."""
+    api = timed_api()
+    client = MemoryClient(api)
+    api.is_busy = True
+    client.send(TOUCHING * 100)
+    await asyncio.sleep(0.001)
+    assert api.names == []
+
+    client.send(b'{"jsonrpc":"2.0","method":"stop","para')
+    client.send(b'ms":{}}\n')
+    await asyncio.sleep(0.0001)
+
+    assert api.times("stop") == pytest.approx([0.001], abs=1e-6)
+    assert runs(api.names) == [("touch", 100), ("stop", 1)]
+
+
+@in_virtual_time
+async def test_lines_that_only_look_like_a_stop_keep_no_other_client_waiting() -> None:
+    """A stop of another client among them comes after one of them."""
+    api = timed_api()
+    misleading = request("renew", '{"lease":"stop"}')
+    for client in connect(api, 3):
+        client.send(misleading * 100)
+    asking, stopping = connect(api, 2)
+    asking.send(ASKING)
+    stopping.send(line("stop"))
+
+    await iterate(12)
+
+    assert api.names.index("stop") <= 4
+    leases = [params.model_dump().get("lease") for _, params, _ in api.calls]
+    assert "a-lease" in leases
+
+
+@in_virtual_time
+async def test_server_limits_the_request_rate_except_for_stop_disarm_and_touch() -> None:
+    """After 2000 requests at once further ones are refused."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await client.ask(ASKING * (RATE_LIMIT + 1))
+    assert runs(api.names) == [("renew", RATE_LIMIT)]
+
+    api.calls.clear()
+    await client.ask(line("stop"), line("disarm"), TOUCHING, line("clear"))
+    assert api.names == ["stop", "disarm", "touch"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"\n", b"{}\n", line("no_such_method"), request("effects", '{"x":1}')],
+    ids=["empty", "no request", "unknown method", "unknown parameter"],
+)
+@in_virtual_time
+async def test_refused_lines_count_in_the_rate(text: bytes) -> None:
+    """After 2000 at once the connection is closed with an error."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    await exceed_the_rate(client, text)
+    assert client.is_open
+    await client.ask(text)
+
+    assert client.responses() == [(None, ErrorCode.BUSY)]
+    assert not client.is_open
+
+
+@in_virtual_time
+async def test_place_is_taken_from_no_client_that_has_asked_within_a_second() -> None:
+    """Nor from the holder of the lease, or from a client that waits for a response."""
+    api = timed_api()
+    holder = MemoryClient(api)
+    api.holder = holder.connection
+    waiting = MemoryClient(api)
+    await waiting.ask(line("arm", 1))
+    await asyncio.sleep(98.1)
+    asking = MemoryClient(api)
+    await asking.ask(ASKING)
+    await asyncio.sleep(0.9)
+    clients = connect(api, 29)
+    await ask_in_turn(clients, ASKING)
+
+    new = MemoryClient(api)
+
+    assert new.connection.is_reserve
+    assert places([holder, waiting, asking, *clients, new]) == 33
+
+
+@in_virtual_time
+async def test_place_is_taken_from_the_client_that_is_idle_for_longest() -> None:
+    """Of one that has asked 3 s ago and one 2 s ago, not from the holder of the lease."""
+    api = timed_api()
+    holder = MemoryClient(api)
+    api.holder = holder.connection
+    await asyncio.sleep(96)
+    idle = MemoryClient(api)
+    await idle.ask(ASKING)
+    await asyncio.sleep(1)
+    asking = MemoryClient(api)
+    await asking.ask(ASKING)
+    await asyncio.sleep(2)
+    clients = connect(api, 29)
+    await ask_in_turn(clients, ASKING)
+
+    new = MemoryClient(api)
+
+    assert not new.connection.is_reserve
+    assert not idle.is_open
+    assert places([holder, asking, *clients, new]) == 32
+
+
+@in_virtual_time
+async def test_place_is_taken_from_a_client_that_has_asked_more_than_a_second_ago() -> None:
+    """Rather than from one that has waited for a response since before that."""
+    api = timed_api()
+    waiting = MemoryClient(api)
+    await waiting.ask(line("arm", 1))
+    await asyncio.sleep(1.9)
+    idle = MemoryClient(api)
+    await idle.ask(ASKING)
+    await asyncio.sleep(1.1)
+    clients = connect(api, 30)
+    await ask_in_turn(clients, ASKING)
+
+    new = MemoryClient(api)
+
+    assert not new.connection.is_reserve
+    assert not idle.is_open
+    assert places([waiting, *clients, new]) == 32
+
+
+@in_virtual_time
+async def test_client_in_reserve_survives_a_process_that_connects_again_and_again() -> None:
+    """Before its first bytes and after them; the reserve of eight stays bounded."""
+    api = timed_api()
+    first = connect(api, 32)
+    client = MemoryClient(api, process=4711)
+    flood = list[MemoryClient]()
+
+    for id, method in enumerate(["hello", "stop", "disarm"]):
+        for _ in range(1000):
+            await asyncio.sleep(0.0002)
+            flood.append(MemoryClient(api))
+        await client.ask(line(method, id))
+        assert client.responses() == [(id, RESULT)]
+
+    assert [places(first), places([client]), places(flood)] == [32, 1, 7]
+
+
+@in_virtual_time
+async def test_bug_in_a_method_is_reported_without_details(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The details are in the log alone."""
+    client = MemoryClient(timed_api())
+
+    await client.ask(line("play", 1))
+
+    assert b"/a/path" not in client.wire.waiting
+    assert client.responses() == [(1, ErrorCode.INTERNAL)]
+    assert "/a/path" in caplog.text
+
+
+@pytest.mark.usefixtures("long_turns")
+@in_virtual_time
+async def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a text that is not Unicode; the next line is served in the same turn."""
+    monkeypatch.setattr(StatusResult, "model_dump_json", Mock(side_effect=UnicodeError))
+    client = MemoryClient(timed_api())
+
+    await client.ask(line("status", 1), line("disarm", 2))
+
+    assert client.responses() == [(1, ErrorCode.INTERNAL), (2, RESULT)]
+
+
+async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path) -> None:
+    """However far it has come when the server looks at those that are open."""
+    for iterations in range(6):
+        api = ApiServer({}, on_disconnect=Mock(), holds_lease=lambda client: False)
+        path = str(tmp_path / f"{iterations}.sock")
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(path)
+        await api.open(listener)
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(path)
+            await iterate(iterations)
+            await api.close()
+            client.setblocking(False)
+            with suppress(ConnectionResetError):  # it was never accepted
+                async with asyncio.timeout(PATIENCE / 6):
+                    assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
+
+
+def fail(*_: object) -> None:
+    """Fail by a bug."""
+    raise ZeroDivisionError("a bug")
+
+
+@pytest.mark.parametrize("function", ["silencing.parse_json", "server.read_params"])
+async def test_stop_is_carried_out_although_reading_it_fails(
+    monkeypatch: pytest.MonkeyPatch, function: str
+) -> None:
+    """By a bug, which its client is told."""
+    api, connection, wire = serving()
+    monkeypatch.setattr(f"controller.api.{function}", fail)
+    monkeypatch.setattr("controller.api.server.read_request", fail)
+
+    await api.takes(connection, line("stop", 1))
+
+    assert (api.names, api.stops) == (["stop"], 0)
+    assert [response["error"]["code"] for response in wire.lines()] == [ErrorCode.INTERNAL]
+
+
+async def test_server_stops_all_if_the_method_of_a_stop_fails() -> None:
+    """Its client is not told of success."""
+    api, connection, wire = serving()
+    api.called = fail
+
+    await api.takes(connection, line("stop", 1))
+
+    assert (api.names, api.stops) == (["stop"], 1)
+    assert [response["error"]["code"] for response in wire.lines()] == [ErrorCode.INTERNAL]
+
+
 @in_virtual_time
 async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Whose lines take 30 us each: four of ten."""
-    lines = 0
-
-    def count(name: str) -> None:
-        nonlocal lines
-        lines += 1
-
+    """Of ten lines of 30 us each, four are served in the first turn."""
     monkeypatch.undo()
-    monkeypatch.setattr(server.time, "perf_counter", lambda: 30e-6 * lines)
-    served = serve()
-    served.called = count
-    feed(served.client()[0], REQUEST * 10)
+    api = timed_api()
+    monkeypatch.setattr(server.time, "perf_counter", lambda: 30e-6 * len(api.calls))
+
+    MemoryClient(api).send(ASKING * 10)
     await iterate(3)
-    assert lines == 4
 
-
-def connect(now: Callable[[], float]) -> tuple[Connection, Wire]:
-    """A connection to a server with a clock, and its transport."""
-    return ServedApi(clock=now).client()
+    assert len(api.calls) == 4
 
 
 def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
-    """At 256 KiB and a byte; a single response may be longer."""
-    connection, wire = connect(lambda: 0.0)
-    connection.respond(b"x" * (MAX_UNREAD_BYTES - 1))
-    connection.respond(b"\n")
-    assert (len(wire.waiting), wire.is_aborted) == (1 << 18, False)
-    connection.respond(b"\n")
-    assert (len(wire.waiting), wire.is_aborted) == (1 << 18, True)
-    connection, wire = connect(lambda: 0.0)
-    connection.respond(b"x" * (4 * MAX_UNREAD_BYTES))
-    assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
+    """It holds 256 KiB, and is closed by another byte."""
+    client = MemoryClient(ServedApi())
+
+    client.connection.respond(b"x" * (MAX_UNREAD_BYTES - 1))
+    client.connection.respond(b"\n")
+    assert (len(client.wire.waiting), client.wire.is_aborted) == (1 << 18, False)
+    client.connection.respond(b"\n")
+    assert (len(client.wire.waiting), client.wire.is_aborted) == (1 << 18, True)
+
+
+def test_single_response_may_be_longer_than_256_kib() -> None:
+    """A response of 1 MiB does not close the connection."""
+    client = MemoryClient(ServedApi())
+
+    client.connection.respond(b"x" * (4 * MAX_UNREAD_BYTES))
+
+    assert (len(client.wire.waiting), client.wire.is_aborted) == (1 << 20, False)
 
 
 async def test_input_of_a_client_is_bounded() -> None:
     """Nothing is read while 64 KiB wait to be served; no line is, beside 64 stops on their way."""
-    served, client, wire = serving()
-    client.pending = {asyncio.ensure_future(asyncio.sleep(3600)) for _ in range(64)}
-    await served.takes(client, request("stop") * 2000)
-    assert (served.names, wire.is_read) == ([], False)
-    client.pending.pop().cancel()
-    await served.takes(client, b"\n")
-    assert (served.names, wire.is_read) == (["stop"] * 2000, True)
-    for each in client.pending:
-        each.cancel()
+    api, connection, wire = serving()
+    pending_stops = [asyncio.ensure_future(asyncio.sleep(3600)) for _ in range(64)]
+    connection.pending = set(pending_stops)
+
+    await api.takes(connection, line("stop") * 2000)
+    assert (api.names, wire.is_read) == ([], False)
+
+    connection.pending.remove(pending_stops[0])
+    await api.takes(connection, b"\n")
+    assert (api.names, wire.is_read) == (["stop"] * 2000, True)
+    for stop in pending_stops:
+        stop.cancel()
 
 
-def test_client_that_does_not_read_loses_notifications_then_the_connection() -> None:
-    """Unread output stays bounded, the next event counts the lost ones, then it is closed."""
-    now = 0.0
-    connection, wire = connect(lambda: now)
-    counts: list[int] = []
+def test_client_that_does_not_read_loses_notifications_and_then_the_connection() -> None:
+    """Half of 256 KiB are kept; the next event counts 372 lost of 500; 5 s later it is closed."""
+    now = [0.0]
+    client = MemoryClient(ServedApi(clock=lambda: now[0]))
+    lost_counts = list[int]()
 
-    def make(lost: int) -> bytes:
-        counts.append(lost)
+    def notify(count: int) -> None:
+        for _ in range(count):
+            client.connection.notify(make_event)
+
+    def make_event(lost: int) -> bytes:
+        lost_counts.append(lost)
         return b"x" * 1023 + b"\n"
 
-    for _ in range(500):
-        connection.notify(make)
-    assert (counts, len(wire.waiting)) == ([0] * 128, MAX_UNREAD_BYTES // 2)
-    wire.waiting = b""
-    connection.notify(make)
-    assert counts[-1] == 372
-    for now in (0.0, 4.9, 5.1):  # noqa: B007  s, from the first loss on; read by the clock
-        assert not wire.is_aborted
-        for _ in range(500):
-            connection.notify(make)
-    assert wire.is_aborted
+    notify(500)
+    assert lost_counts == [0] * 128
+    assert len(client.wire.waiting) == MAX_UNREAD_BYTES // 2
 
+    client.wire.waiting = b""
+    notify(1)
+    assert lost_counts[-1] == 372
 
-async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:
-    """The failure is logged once, outside the topic of the log; later events are sent."""
-    hub = Hub({}, clock=lambda: 0.0)
-    connection, wire = connect(lambda: 0.0)
-    hub.subscribe(connection, ["log", "contacts"])
-
-    def fail() -> ApiMessage:
-        raise ZeroDivisionError
-
-    for topic in ("log", "contacts", "log"):
-        hub.publish(topic, fail)  # type: ignore[arg-type]
-    await asyncio.sleep(0.03)
-    assert [hasattr(record, "topic") for record in caplog.records] == [True, True]
-    hub.publish("contacts", lambda: ContactsEvent(contacts=[]))
-    await asyncio.sleep(0.03)
-    assert b'"topic":"contacts"' in wire.waiting
-    hub.close()
-
-
-@in_virtual_time
-async def test_hub_sends_the_newest_of_changes_at_most_sixty_times_per_second() -> None:
-    """A thousand changes make one event, a sixtieth of a second after the previous one.
-
-    Records of the log are sent one by one, immediately.
-    """
-    loop = asyncio.get_running_loop()
-    hub = Hub({}, clock=loop.time)
-    connection, wire = connect(loop.time)
-    hub.subscribe(connection, ["contacts", "log"])
-    wire.lines()
-    made = 0
-
-    def make() -> ApiMessage:
-        nonlocal made
-        made += 1
-        return ContactsEvent(contacts=[])
-
-    async def seconds_until_sent() -> float:
-        began_at = loop.time()
-        for _ in range(1000):
-            hub.publish("contacts", make)
-        while not wire.waiting:  # noqa: ASYNC110 - virtual time
-            await asyncio.sleep(0.0001)
-        topics = [line["params"]["topic"] for line in wire.lines()]
-        assert topics == ["contacts"]
-        return loop.time() - began_at
-
-    assert await seconds_until_sent() < 0.001
-    assert await seconds_until_sent() == pytest.approx(1 / MAX_RATE, abs=0.001)
-    await asyncio.sleep(1.0)
-    assert await seconds_until_sent() < 0.001
-    assert made == 3
-    for _ in range(3):
-        hub.publish("log", lambda: LogEvent(level="info", message="", cause=None, remedy=None))
-    assert [line["params"]["topic"] for line in wire.lines()] == ["log"] * 3
-    hub.close()
-
-
-async def test_hub_sends_each_periodic_topic_at_its_own_rate() -> None:
-    """A later subscription to another topic leaves that of the first; both end with the client."""
-    hub = Hub({"amplifiers": lambda: None, "latency": lambda: None}, clock=lambda: 0.0)
-    connection, _ = connect(lambda: 0.0)
-    loop = asyncio.get_running_loop()
-    hub.subscribe(connection, ["amplifiers"], rate=2.0)
-    hub.subscribe(connection, ["latency"], rate=50.0)
-    topics = hub.subscriptions[connection]
-    timers = {topic: cast(asyncio.TimerHandle, timer) for topic, timer in topics.items()}
-    due = {topic: timer.when() - loop.time() for topic, timer in timers.items()}
-    assert due == pytest.approx({"amplifiers": 0.5, "latency": 0.02}, abs=0.015)
-    hub.forget(connection)
-    assert all(timer.cancelled() for timer in timers.values())
-    assert not hub.subscriptions
+    notify(500)
+    now[0] = 4.9  # s after the first loss
+    notify(500)
+    assert not client.wire.is_aborted
+    now[0] = 5.1
+    notify(500)
+    assert client.wire.is_aborted

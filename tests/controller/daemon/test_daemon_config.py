@@ -49,10 +49,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def written(folder: Path, more: str = "", *, rig: str = "rig.yaml") -> Path:
+def written(folder: Path, further_lines: str = "", *, rig: str = "rig.yaml") -> Path:
     """A daemon's file with these further lines."""
     path = folder / "daemon.yaml"
-    path.write_text(f"rig: {rig}\n{more}", encoding="utf-8")
+    path.write_text(f"rig: {rig}\n{further_lines}", encoding="utf-8")
     return path
 
 
@@ -107,7 +107,7 @@ def test_config_paths_are_relative_to_its_folder(
 
 
 @pytest.mark.parametrize(
-    ("rig", "more", "expected"),
+    ("rig", "further_lines", "expected"),
     [
         (r'"a\0b"', "", [(1, "rig")]),
         ("[1]", "", [(1, "rig")]),
@@ -156,9 +156,11 @@ def test_config_paths_are_relative_to_its_folder(
         ),
     ],
 )
-def test_config_refuses(folder: Path, rig: str, more: str, expected: list[tuple[int, str]]) -> None:
+def test_config_refuses(
+    folder: Path, rig: str, further_lines: str, expected: list[tuple[int, str]]
+) -> None:
     """Impossible paths, unknown amplifiers, reserved names, wrong shapes; all at once."""
-    assert problems(written(folder, more, rig=rig)) == expected
+    assert problems(written(folder, further_lines, rig=rig)) == expected
 
 
 @pytest.mark.parametrize("name", ["car_display", "table"])
@@ -167,7 +169,7 @@ def test_example_with_several_simulated_amplifiers_is_accepted(name: str) -> Non
     config = load_daemon_config(EXAMPLES / f"{name}_daemon.yaml")
     rig = EXAMPLES.resolve() / f"{name}.yaml"
     assert len(config.urls) > 2
-    assert config.urls == {each: f"sim://{rig}?amplifier={each}" for each in config.urls}
+    assert config.urls == {name: f"sim://{rig}?amplifier={name}" for name in config.urls}
     assert None not in config.layouts
 
 
@@ -312,9 +314,9 @@ def test_reload_applies_layouts_alone_and_raises_no_level_while_armed(
 
     old, new = loaded({}), loaded(change)
     for is_armed, reason in ((True, while_armed), (False, disarmed)):
-        found = "; ".join(config_change(old, new).refusals(is_armed=is_armed))
-        assert reason in found
-        assert bool(found) is bool(reason)
+        refusals = "; ".join(config_change(old, new).refusals(is_armed=is_armed))
+        assert reason in refusals
+        assert bool(refusals) is bool(reason)
     text = (folder / "rig.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(text.replace("level: 1.0", "level: 0.9"), "utf-8")
     assert config_change(old, loaded(change)).refusals(is_armed=False)
@@ -326,12 +328,14 @@ REGIONS = 64  # as many as a layout may have
 def write_layout(path: Path) -> None:
     """A layout of many regions, each with an effect of its own."""
     lines = ["effects:"]
-    lines += [f"  e{each}: {{kind: buzz, level: {10 + each % 10}}}" for each in range(REGIONS)]
+    lines += [
+        f"  e{number}: {{kind: buzz, level: {10 + number % 10}}}" for number in range(REGIONS)
+    ]
     lines += ["regions:"]
-    for each in range(REGIONS):
-        x, y = 0.01 * (each % 20), 0.01 * (each // 20)
+    for number in range(REGIONS):
+        x, y = 0.01 * (number % 20), 0.01 * (number // 20)
         corners = f"start: [{x}, {y}], end: [{x + 0.009:g}, {y + 0.009:g}]"
-        lines.append(f"  r{each}: {{rectangle: {{{corners}}}, on_press: e{each}}}")
+        lines.append(f"  r{number}: {{rectangle: {{{corners}}}, on_press: e{number}}}")
     path.write_text("\n".join([*lines, "elsewhere: null", ""]), encoding="utf-8")
 
 

@@ -100,12 +100,12 @@ def test_commands_choose_a_layout_and_reload(
         return status, "".join(capsys.readouterr())
 
     with real_daemon(tmp_path, LAYOUTS) as socket, Client.connect(socket) as client:
-        status, said = era("layout", "use", "climate", "--json")
-        assert (status, json.loads(said)["layout"]) == (0, "climate")
-        status, said = era("layout", "use", "climat")
+        status, output = era("layout", "use", "climate", "--json")
+        assert (status, json.loads(output)["layout"]) == (0, "climate")
+        status, output = era("layout", "use", "climat")
         assert status == BAD_INPUT
-        assert said.count("\n") == 1
-        assert "did you mean climate" in said
+        assert output.count("\n") == 1
+        assert "did you mean climate" in output
         assert "\n  layout climate (of home, climate)\n" in era("status")[1]
         assert era("strength", "python", "-6") == era("strength") == (0, "python: -6 dB\n")
         config, home = tmp_path / "daemon.yaml", tmp_path / "home.yaml"
@@ -123,13 +123,13 @@ def test_commands_choose_a_layout_and_reload(
         ):
             config.write_text(keys, "utf-8")
             home.write_text(f"elsewhere: {elsewhere}\n", "utf-8")
-            status, said = era("reload", "--json")
-            assert (status, json.loads(said)["reloaded"]) == (1 - is_done, is_done)
-            for found, expected in zip(json.loads(said)["reasons"], reasons, strict=True):
-                assert found.startswith(expected)
+            status, output = era("reload", "--json")
+            assert (status, json.loads(output)["reloaded"]) == (1 - is_done, is_done)
+            for reason, expected in zip(json.loads(output)["reasons"], reasons, strict=True):
+                assert reason.startswith(expected)
             assert (client.status().layout == "climate") is ("climate" in keys)
     log = [json.loads(line) for line in (tmp_path / "daemon.log").read_text("utf-8").splitlines()]
-    verdicts = [each["level"] for each in log if each["message"].startswith("config: reload")]
+    verdicts = [record["level"] for record in log if record["message"].startswith("config: reload")]
     assert verdicts == ["info", "error", "info"]
 
 
@@ -158,9 +158,9 @@ async def test_daemon_ramps_down_reads_back_and_disarms_when_terminated(
             requests = [entry for entry in journal.since(begin) if entry.amplifier == name]
             end = next(entry for entry in requests if entry.name == "Disarm")
             assert end.values["ramp"] == 50
-            after = [entry for entry in requests if entry.time > end.time]
-            assert {entry.name for entry in after} == {"GetStatus"}
-            assert not any(after[-1].levels)  # read back until it is silent
+            later_requests = [entry for entry in requests if entry.time > end.time]
+            assert {entry.name for entry in later_requests} == {"GetStatus"}
+            assert not any(later_requests[-1].levels)  # read back until it is silent
             assert far.summary(name).state == "SWITCH_ON_DISABLED"
 
 
@@ -259,8 +259,8 @@ async def test_names_with_a_strength_are_bounded(tmp_path: Path) -> None:
                 await era.strength(name=names[0], gain_db=0)
             await era.strength(name=name, gain_db=-1)
             await era.touch([], source=name)
-    kept = json.loads((tmp_path / "kept.json").read_text())
-    assert kept == dict.fromkeys(names[1:], -1)
+    strengths = json.loads((tmp_path / "kept.json").read_text())
+    assert strengths == dict.fromkeys(names[1:], -1)
 
 
 @in_virtual_time
@@ -330,17 +330,17 @@ def test_lease_lasts_its_duration_from_each_renewal_by_its_token() -> None:
 def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger) -> None:
     """However it ends; the epoch says what may not go on afterwards."""
     lease = Lease("me", 5, expires_at=10.0) if state in ENERGISED else None
-    before = Operation(state, lease=lease, epoch=7)
-    after, _ = step(before, DaemonEvent(trigger, "a test", lease=Lease("you", 3)), 6.0)
-    if after.state in ENERGISED:
-        is_new = after.state is not state
+    operation = Operation(state, lease=lease, epoch=7)
+    updated, _ = step(operation, DaemonEvent(trigger, "a test", lease=Lease("you", 3)), 6.0)
+    if updated.state in ENERGISED:
+        is_new = updated.state is not state
         owner = "you" if is_new and trigger is Trigger.ARM else "me"
         end = {"you": 9.0, "me": 11.0}[owner] if is_new else 10.0
-        assert (after.lease.owner, after.lease.expires_at) == (owner, end)
+        assert (updated.lease.owner, updated.lease.expires_at) == (owner, end)
     else:
-        assert after.lease is None
-    if state in ENERGISED and after.state not in ENERGISED:
-        assert after.epoch == 8
+        assert updated.lease is None
+    if state in ENERGISED and updated.state not in ENERGISED:
+        assert updated.epoch == 8
 
 
 @pytest.mark.parametrize(
@@ -380,8 +380,8 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
     monkeypatch.setattr(
         "controller.daemon.daemon.start_log", lambda file, *, level: LogThread(file)
     )
-    more = 'dashboard: "127.0.0.1:0"\n'
-    run_daemon(write_daemon(tmp_path, {"main": "sim://"}, more), dashboard=None)
+    further_line = 'dashboard: "127.0.0.1:0"\n'
+    run_daemon(write_daemon(tmp_path, {"main": "sim://"}, further_line), dashboard=None)
     assert pages == [None]
     (line,) = caplog.messages
     assert "pip install -e '.[gateway]'" in line
@@ -395,9 +395,13 @@ def test_daemon_refuses_to_start_with_little_memory_or_few_descriptors(
     Below 64 descriptors its own files and 40 clients would use them up.
     """
     limits = {resource.RLIMIT_AS: (300 << 20, resource.RLIM_INFINITY)}
-    others = resource.getrlimit
+    real_limits = resource.getrlimit
     with monkeypatch.context() as patched:
-        patched.setattr(resource, "getrlimit", lambda what: limits.get(what) or others(what))
+        patched.setattr(
+            resource,
+            "getrlimit",
+            lambda resource_id: limits.get(resource_id) or real_limits(resource_id),
+        )
         with pytest.raises(InputError, match="512 MB, got 300 MB"):
             run_daemon(Path("missing.yaml"), dashboard=None)
     monkeypatch.setattr("controller.daemon.daemon.allow_many_descriptors", lambda: 63)
@@ -444,10 +448,10 @@ async def test_readings_are_shown_with_their_unit_to_their_step(tmp_path: Path) 
         pages, status = (await era.hello("test")).readings, await era.status()
         assert pages["temperature_c"] == ("Temperature", "°C", 1)
         assert "temperature 25.0 °C" in show_status(status)
-        for each, value in stated_readings(bench):
-            assert getattr(status.amplifiers[0], each.key) == pytest.approx(value)
-            shown = each.key in pages, f" {each.label} " in show_status(status)
-            assert shown == ("page" in each.views, "status" in each.views)
+        for reading, value in stated_readings(bench):
+            assert getattr(status.amplifiers[0], reading.key) == pytest.approx(value)
+            places = reading.key in pages, f" {reading.label} " in show_status(status)
+            assert places == ("page" in reading.views, "status" in reading.views)
 
 
 @in_virtual_time
@@ -466,9 +470,9 @@ async def test_status_shows_levels_of_one_threshold_set_and_names_it(tmp_path: P
         foreign_level_db_sl=33.4,
         rig_foreign_level_db_sl=5.4,
     )
-    shown = show_status(status.model_copy(update={"contacts": [finger]}))
-    assert "levels above the thresholds of vibrotactile-probe" in shown
-    assert "20.0 dB SL, others at most 5.4 dB SL" in shown
+    text = show_status(status.model_copy(update={"contacts": [finger]}))
+    assert "levels above the thresholds of vibrotactile-probe" in text
+    assert "20.0 dB SL, others at most 5.4 dB SL" in text
 
 
 def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:

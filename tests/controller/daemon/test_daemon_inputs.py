@@ -83,17 +83,17 @@ async def test_touches_of_clients_are_delivered_and_lifted_when_one_leaves(
                 await leaving.touch([(0.1, 0.1)], source=source)
             await leaving.touch([], source="lifted")
             await era.touch([(0.2, 0.1)], source="one")
-            down = [each.source for each in (await era.status()).contacts]
+            down = [contact.source for contact in (await era.status()).contacts]
             assert down == ["api:1:fails", "api:1:one", "api:2:one"]
         first, *_, last = frames
         assert (first.source, first.origin) == ("api:1:lifted", "api:1")
         assert (last.source, last.origin) == ("api:2:one", "api:2")
         assert first.time <= threads.now()
-        assert [(each.x, each.y) for each in first.touches] == [
+        assert [(contact.x, contact.y) for contact in first.touches] == [
             pytest.approx(place) for place in ((0.25, 0.5), (0.75, 0.75))
         ]
         await asyncio.sleep(0.02)
-        down = [each.source for each in (await era.status()).contacts]
+        down = [contact.source for contact in (await era.status()).contacts]
         assert down == ["api:1:fails", "api:2:one"]
 
 
@@ -146,21 +146,25 @@ async def test_inputs_run_beside_each_other(
     frames: list[TouchFrame] = []
     lifted: list[str] = []
     inputs = touch_inputs(frames.append, lifted.append)
-    one, two, three = (
+    left_input, two, three = (
         TouchInput(name, url, turned(180))
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
     )
-    inputs.start([one, two, three])
+    inputs.start([left_input, two, three])
     await until(lambda: len(frames) == 3 and caplog.messages)
-    assert sorted(each.source for each in frames) == ["left:'x\\x1b[2J'", "right:y", "table:z"]
-    for each in frames:
-        assert (each.time, each.timeout) == (1.5, 3.0)
-        assert each.touches[0] == Touch(4, 0.75, 0.5)
-        assert (each.touches[1].id, math.isnan(each.touches[1].x)) == (5, True)
+    assert sorted(touch_frame.source for touch_frame in frames) == [
+        "left:'x\\x1b[2J'",
+        "right:y",
+        "table:z",
+    ]
+    for touch_frame in frames:
+        assert (touch_frame.time, touch_frame.timeout) == (1.5, 3.0)
+        assert touch_frame.touches[0] == Touch(4, 0.75, 0.5)
+        assert (touch_frame.touches[1].id, math.isnan(touch_frame.touches[1].x)) == (5, True)
     assert caplog.messages == ["touch source right: failed, restarting: unplugged"]
     assert lifted == ["right:"]
     states = ["open", "missing", "mute"]
-    await until(lambda: [each.state for each in inputs.event.inputs] == states)
+    await until(lambda: [event.state for event in inputs.event.inputs] == states)
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
     assert sorted(lifted[1:]) == ["left:", "table:"]
@@ -226,8 +230,8 @@ async def test_failed_input_is_restarted_after_growing_pauses(
         await sleep(0.001)
     failed = "touch source left: failed, restarting: "
     assert caplog.messages == [f"{failed}not plugged in", f"{failed}gone"]
-    assert (len(runs), [each for each in paused if each != 0.5]) == (3, [1.0, 2.0])
-    assert [each.state for each in inputs.event.inputs] == ["ended"]
+    assert (len(runs), [pause for pause in paused if pause != 0.5]) == (3, [1.0, 2.0])
+    assert [event.state for event in inputs.event.inputs] == ["ended"]
     await inputs.close()
 
 
@@ -237,30 +241,34 @@ async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) ->
 
     The plate is 0.3048 m by 0.2286 m, TUIO counts downwards, and one panel is upside down.
     """
-    one, two = free_port(), free_port()
-    more = (
+    first_port, second_port = free_port(), free_port()
+    further_lines = (
         "touch:\n"
-        f'  - {{name: left, url: "tuio:127.0.0.1:{one}"}}\n'
-        f'  - {{name: right, url: "tuio:127.0.0.1:{two}", calibration: {{turned: 180}}}}\n'
+        f'  - {{name: left, url: "tuio:127.0.0.1:{first_port}"}}\n'
+        f'  - {{name: right, url: "tuio:127.0.0.1:{second_port}", calibration: {{turned: 180}}}}\n'
     )
-    async with ready_daemon(tmp_path, more) as (_, era):
+    async with ready_daemon(tmp_path, further_lines) as (_, era):
         await era.arm("me", lease_s=60)
-        found: dict[tuple[str, int], tuple[float, float]] = {}
+        positions: dict[tuple[str, int], tuple[float, float]] = {}
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for number in range(1, 2000):
-                for port in (one, two):
+                for port in (first_port, second_port):
                     frame = TouchFrame("panel", 0.0, (Touch(7, 0.25, 0.25),))
                     sender.sendto(tuio_datagram(frame, number), ("127.0.0.1", port))
                 await era.touch([(0.15, 0.1)])
                 await asyncio.sleep(0.02)
                 contacts = (await era.status()).contacts
-                if sorted(each.role or "" for each in contacts) == ["quiet", "quiet", "target"]:
-                    found = {
-                        (each.source.partition(":")[0], each.id): (each.x_m, each.y_m)
-                        for each in contacts
+                if sorted(contact.role or "" for contact in contacts) == [
+                    "quiet",
+                    "quiet",
+                    "target",
+                ]:
+                    positions = {
+                        (contact.source.partition(":")[0], contact.id): (contact.x_m, contact.y_m)
+                        for contact in contacts
                     }
                     break
-        assert found == {
+        assert positions == {
             ("left", 7): pytest.approx((0.0762, 0.17145)),
             ("right", 7): pytest.approx((0.2286, 0.05715)),
             ("api", 1): pytest.approx((0.15, 0.1)),
@@ -274,26 +282,26 @@ async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> N
     What a source rejects is counted with what cannot be a contact.
     """
     port = free_port()
-    more = (
+    further_lines = (
         "touch:\n"
         '  - {name: gone, url: "evdev:/dev/input/event987"}\n'
         f'  - {{name: table, url: "tuio:127.0.0.1:{port}"}}\n'
     )
-    other = bundle(message("set", 1, 0.5, 0.5, 0.1, address="/tuio/25Dblb"))
+    unknown_profile = bundle(message("set", 1, 0.5, 0.5, 0.1, address="/tuio/25Dblb"))
     fingers = TouchFrame("table", 0.0, (Touch(1, 0.5, 0.5), Touch(2, 1.5, 0.5)))
-    async with ready_daemon(tmp_path, more) as (_, era):
-        shown = []
-        for datagram in (other, tuio_datagram(fingers, 1)):
+    async with ready_daemon(tmp_path, further_lines) as (_, era):
+        summaries = []
+        for datagram in (unknown_profile, tuio_datagram(fingers, 1)):
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 sender.sendto(datagram, ("127.0.0.1", port))
             await asyncio.sleep(12)
             status = await era.status()
-            shown.append([line.split(":")[:2] for line in show_status(status).splitlines()])
+            summaries.append([line.split(":")[:2] for line in show_status(status).splitlines()])
         await era.subscribe("inputs")
         event = await era.next_event()
-    gone, ready = ["touch gone", " missing"], ["ready", *shown[0][2][1:]]
-    assert shown[0][:3] == [gone, ["touch table", " mute"], ready]
-    assert shown[1][:2] == [gone, ready]
+    gone, ready = ["touch gone", " missing"], ["ready", *summaries[0][2][1:]]
+    assert summaries[0][:3] == [gone, ["touch table", " mute"], ready]
+    assert summaries[1][:2] == [gone, ready]
     assert status.rejected_touches == {"profile_25Dblb": 1, "off_plate": 1}
     assert "/tuio/25Dblb" in status.rejected_examples["profile_25Dblb"]
     assert InputsEvent.model_validate(event.data).inputs == status.inputs
@@ -337,11 +345,11 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
 
 
 LONGEST, STOPPED_WITHIN = 5, 20  # ms of processor time, of a machine that does `unit` in one
-_JOB = [{"number": each, "values": [0.1 * each] * 8} for each in range(180)]
+_JOB = [{"number": number, "values": [0.1 * number] * 8} for number in range(180)]
 ROUNDS = 5  # of which the quickest counts: the first of anything may be slower
 FILES = 8  # of 60 s, in each of two layouts
 PLACE, THERE = (0.1, 0.02), 5  # in a region, with the file of that number
-TOUCHES = [(0.02 * (each % 10) + 0.01, 0.02 * (each // 10) + 0.05) for each in range(20)]
+TOUCHES = [(0.02 * (number % 10) + 0.01, 0.02 * (number // 10) + 0.05) for number in range(20)]
 
 
 def write_layouts(folder: Path, level: float) -> str:
@@ -352,12 +360,25 @@ def write_layouts(folder: Path, level: float) -> str:
             # Answers to the finger, which are not measured, would take seconds for a long one.
             part = 0.2 if number == THERE else 2.0
             parts = [
-                {"Event": {"Time": part * each, "EventDuration": part, **_KIND, **_intensity(each)}}
-                for each in range(number, 30)
+                {
+                    "Event": {
+                        "Time": part * index,
+                        "EventDuration": part,
+                        **_KIND,
+                        **_intensity(index),
+                    }
+                }
+                for index in range(number, 30)
             ]
             taps = [
-                {"Event": {"Time": 0.05 * each, "EventType": "HapticTransient", **_intensity(each)}}
-                for each in range(1200)
+                {
+                    "Event": {
+                        "Time": 0.05 * index,
+                        "EventType": "HapticTransient",
+                        **_intensity(index),
+                    }
+                }
+                for index in range(1200)
             ]
             pattern = [*parts, *(taps if number == FILES - 1 else [])]
             content = {"Version": 1.0, "Pattern": pattern}
@@ -408,19 +429,19 @@ def iterations() -> Iterator[list[float]]:
     once = asyncio.BaseEventLoop._run_once
 
     def left_out(work: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*given: Any) -> Any:
-            before, already = time.thread_time(), apart[0]
+        def timed(*arguments: Any) -> Any:
+            start, already = time.thread_time(), apart[0]
             try:
-                return work(*given)
+                return work(*arguments)
             finally:
-                apart[0] = already + time.thread_time() - before
+                apart[0] = already + time.thread_time() - start
 
         return timed
 
     def measured(loop: asyncio.BaseEventLoop) -> None:
-        apart[0], before = 0.0, time.thread_time()
+        apart[0], start = 0.0, time.thread_time()
         once(loop)
-        times.append(time.thread_time() - before - apart[0])
+        times.append(time.thread_time() - start - apart[0])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(asyncio.BaseEventLoop, "_run_once", measured)
@@ -433,9 +454,9 @@ def unit() -> float:
     """Processor time [s] of a job in plain Python, beside what else this machine does now."""
     times = []
     for _ in range(15):
-        before = time.thread_time()
+        start = time.thread_time()
         json.loads(json.dumps(_JOB))
-        times.append(time.thread_time() - before)
+        times.append(time.thread_time() - start)
     return float(np.median(times))
 
 
@@ -447,16 +468,16 @@ async def touched(folder: Path) -> AsyncIterator[tuple[DaemonBench, AsyncClient,
     """An armed daemon with layouts of many files, a finger that rests, and a panel."""
     received: list[Callable[..., None]] = []
 
-    async def listen(host: str, port: int, given: Callable[..., None], **_: Any) -> Any:
-        received.append(given)
+    async def listen(host: str, port: int, receiver: Callable[..., None], **_: Any) -> Any:
+        received.append(receiver)
         return types.SimpleNamespace(close=lambda: None)
 
     calibration = "{turned: 90, mirror: x}"
     panel = f"touch: [{{name: panel, url: 'tuio:', calibration: {calibration}}}]\n"
-    kept = "strengths: kept.json\n"
+    strengths = "strengths: kept.json\n"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(udp_source, "listen", listen)
-        lines = write_layouts(folder, 20.0) + panel + kept
+        lines = write_layouts(folder, 20.0) + panel + strengths
         async with ready_daemon(folder, lines) as (bench, era):
             await era.arm("me", lease_s=60)
             async with holding(era, PLACE, far=bench.far):
@@ -485,12 +506,12 @@ def calls(
         for _ in range(20):
             with suppress(RpcError):  # of one that must wait for too many
                 await era.play("e3", PLACE, level_db_sl=2 + 0.05 * next(numbers))
-        points = [[0.12 * each, 0.5, 0.5] for each in range(250)]
+        points = [[0.12 * number, 0.5, 0.5] for number in range(250)]
         await era.play(points, PLACE, taps=points)
 
     async def strength() -> None:
-        for each in (await era.status()).strengths:
-            await era.strength(each, -0.1 * (next(numbers) % 300))
+        for name in (await era.status()).strengths:
+            await era.strength(name, -0.1 * (next(numbers) % 300))
 
     async def datagrams() -> None:
         fingers = [(number, x, y) for number, (x, y) in enumerate(places)]
@@ -557,7 +578,7 @@ async def test_nothing_from_outside_holds_the_loop(tmp_path: Path) -> None:
                     if worst[name] <= LONGEST:
                         break
         assert (await era.status()).state == ENABLED
-    assert {name: each for name, each in worst.items() if each > LONGEST} == {}
+    assert {name: duration for name, duration in worst.items() if duration > LONGEST} == {}
 
 
 async def soon(holds: Callable[[], object]) -> None:
@@ -569,26 +590,29 @@ async def soon(holds: Callable[[], object]) -> None:
 @in_virtual_time
 async def test_stop_amid_a_reload_is_sent_at_once(tmp_path: Path) -> None:
     """Before the reload has ended, after 20 ms of processor time at most; all get their answers."""
-    async with touched(tmp_path) as (bench, era, _), await bench.client("another") as other:
+    async with (
+        touched(tmp_path) as (bench, era, _),
+        await bench.client("another") as stopping_client,
+    ):
         loop, written = asyncio.get_running_loop(), asyncio.Event()
         assert isinstance(loop, VirtualLoop)
-        seen = loop.seen
+        observe = loop.seen
 
         def noted(link: str, toward: str, data: bytes) -> None:
             if toward == "amplifier":
                 written.set()
-            seen(link, toward, data)
+            observe(link, toward, data)
 
         reloads = [asyncio.create_task(era.reload()) for _ in range(3)]
-        await soon(lambda: any(each.name == "reload" for each in threading.enumerate()))
+        await soon(lambda: any(reload.name == "reload" for reload in threading.enumerate()))
         with iterations() as times:  # time stands still, so that no heartbeat is due
             loop.seen = noted
-            stopping = asyncio.create_task(other.stop())
+            stopping = asyncio.create_task(stopping_client.stop())
             await written.wait()
         assert sum(times) <= STOPPED_WITHIN * unit()
-        assert not any(each.done() for each in reloads)
+        assert not any(reload.done() for reload in reloads)
         await stopping
-        assert all(each.reloaded for each in await asyncio.gather(*reloads))
+        assert all(reload.reloaded for reload in await asyncio.gather(*reloads))
         assert (await era.status()).state == "QUICK_STOP_ACTIVE"
 
 
@@ -605,16 +629,19 @@ async def test_content_rendered_amid_a_stop_is_not_played(
         return prepare(effect, level_db_sl)
 
     steady = [(0.0, 1.0, 0.5), (1.0, 1.0, 0.5)]
-    async with ready_daemon(tmp_path) as (bench, era), await bench.client("another") as other:
+    async with (
+        ready_daemon(tmp_path) as (bench, era),
+        await bench.client("another") as stopping_client,
+    ):
         monkeypatch.setattr("kit.clock._AWAITED", ())  # time goes on beside the thread
-        await other.arm("me", lease_s=60)
-        async with holding(other, PLACE, far=bench.far):
+        await stopping_client.arm("me", lease_s=60)
+        async with holding(stopping_client, PLACE, far=bench.far):
             monkeypatch.setattr(File, "prepare", slow)
             playing = asyncio.create_task(era.play(steady, PLACE))
             await soon(begun.is_set)
-            await other.stop()
-            await other.clear()
-            await other.arm("me", lease_s=60)
+            await stopping_client.stop()
+            await stopping_client.clear()
+            await stopping_client.arm("me", lease_s=60)
             released.set()
             with pytest.raises(RpcError, match="stopped or disarmed meanwhile"):
                 await playing

@@ -70,8 +70,8 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
     async with ready_daemon(tmp_path) as (bench, era):
         status = await era.status()
         readings = {
-            (f"era_amplifier_{each.metric}", "main"): value
-            for each, value in stated_readings(bench)
+            (f"era_amplifier_{reading.metric}", "main"): value
+            for reading, value in stated_readings(bench)
         }
     link = status.amplifiers[0].statistics
     expected = readings | {
@@ -86,7 +86,7 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
         ("era_touch_to_wire_seconds_bucket", "+Inf"): 0,
     }
     read = scraped(status)
-    assert {each: read[each] for each in expected} == pytest.approx(expected)
+    assert {reading: read[reading] for reading in expected} == pytest.approx(expected)
     latency = status.latency_ms.model_copy(
         update={"count": 9, "histogram": [(1.0, 2), (5.0, 3), (100.0, 4)]}
     )
@@ -148,7 +148,7 @@ async def test_metrics_are_read_once_for_all_and_a_failure_is_answered_and_logge
         monkeypatch.setattr(app, "METRICS_INTERVAL", 0.0)
         await client.get("/metrics")
         assert status.await_count == 2
-        assert [each for each in caplog.records if each.exc_info] == []
+        assert [record for record in caplog.records if record.exc_info] == []
         status.side_effect = ZeroDivisionError
         response = await client.get("/metrics")
         _, writer = await asyncio.open_connection(client.base_url.host, client.base_url.port)
@@ -160,7 +160,7 @@ async def test_metrics_are_read_once_for_all_and_a_failure_is_answered_and_logge
     assert response.status_code == 500
     assert response.headers["x-frame-options"] == "DENY"
     assert "server" not in response.headers
-    errors = [each.exc_info[0] for each in caplog.records if each.exc_info]
+    errors = [record.exc_info[0] for record in caplog.records if record.exc_info]
     assert errors == [ZeroDivisionError] * 2
 
 
@@ -207,9 +207,9 @@ def gateway(
     """One gateway for all tests, with a further allowed origin and host."""
     folder = tmp_path_factory.mktemp("gateway")
     options = ("--allow-origin", ALLOWED, "--allow-host", "panel.example")
-    with gateway_process(folder, daemon.socket, *options) as made:
-        wait_for_daemon(made)
-        yield made
+    with gateway_process(folder, daemon.socket, *options) as process:
+        wait_for_daemon(process)
+        yield process
 
 
 @pytest.fixture(autouse=True)
@@ -260,8 +260,8 @@ def test_http_error_has_the_code_and_data_of_the_api(
     monkeypatch.setattr(daemon, "silence", UNCONFIRMED)
     status, body = call(gateway, "stop")
     assert (status, body["code"]) == (503, 1006)
-    known = {name: each.model_dump() for name, each in UNCONFIRMED.items()}
-    assert body["data"]["amplifiers"] == known
+    silences = {name: silence.model_dump() for name, silence in UNCONFIRMED.items()}
+    assert body["data"]["amplifiers"] == silences
     response = http(gateway, body=b'{"owner": "me",\n  lease_s: 5}')
     assert response.status == 400
     assert "line 2 column 3" in json.loads(response.body)["error"]
@@ -272,16 +272,16 @@ def test_http_touches_belong_to_their_connection(
 ) -> None:
     """A connection has one to the daemon, which ends with it: no other client lifts its fingers."""
     headers = {"Authorization": f"Bearer {TOKEN}"}
-    with httpx.Client(base_url=gateway.url, headers=headers) as kept:
+    with httpx.Client(base_url=gateway.url, headers=headers) as keeping_client:
         for _ in range(2):
-            assert kept.post("api/v1/touch", json=PARAMETERS["touch"]).status_code == 200
+            assert keeping_client.post("api/v1/touch", json=PARAMETERS["touch"]).status_code == 200
         call(gateway, "touch")
-        one, again, other = daemon.callers
-        assert one is again is not other
-        assert re.fullmatch(r"http 127\.0\.0\.1:\d+", one.name)
-        wait_for(lambda: not other.is_open)
-        assert one.is_open
-    wait_for(lambda: not one.is_open)
+        first, again, second = daemon.callers
+        assert first is again is not second
+        assert re.fullmatch(r"http 127\.0\.0\.1:\d+", first.name)
+        wait_for(lambda: not second.is_open)
+        assert first.is_open
+    wait_for(lambda: not first.is_open)
 
 
 def test_http_connections_leave_places_of_the_daemon_to_others(
@@ -290,13 +290,13 @@ def test_http_connections_leave_places_of_the_daemon_to_others(
     """A ninth is refused until one of them closes."""
     headers = {"Authorization": f"Bearer {TOKEN}"}
     with contextlib.ExitStack() as stack:
-        first, *kept, ninth = [
+        first, *middle_clients, ninth = [
             stack.enter_context(httpx.Client(base_url=gateway.url, headers=headers))
             for _ in range(9)
         ]
-        for each in (first, *kept, first):
-            assert each.post("api/v1/status").status_code == 200
-        assert len({id(each) for each in daemon.callers}) == 8
+        for client in (first, *middle_clients, first):
+            assert client.post("api/v1/status").status_code == 200
+        assert len({id(client) for client in daemon.callers}) == 8
         assert ninth.post("api/v1/status").status_code == 429
         with RawWebSocket(gateway):
             pass
@@ -364,9 +364,9 @@ def test_foreign_links_and_allowed_hosts_and_origins_are_served(gateway: Gateway
             "Access-Control-Request-Headers: authorization, content-type",
         ],
     )
-    for each in (response, http(gateway, more=[f"Origin: {ALLOWED}"])):
-        assert each.status == 200
-        assert f"access-control-allow-origin: {ALLOWED}" in each.headers.lower()
+    for reply in (response, http(gateway, more=[f"Origin: {ALLOWED}"])):
+        assert reply.status == 200
+        assert f"access-control-allow-origin: {ALLOWED}" in reply.headers.lower()
     assert "access-control" not in http(gateway).headers.lower()
 
 
@@ -449,21 +449,21 @@ def test_websocket_receives_current_state_and_events(
 
 def test_websocket_is_a_client_of_its_own(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
     """The daemon knows when it has left, and completes what it was sent before."""
-    with RawWebSocket(gateway) as one, RawWebSocket(gateway) as other:
-        for ws in (one, other):
+    with RawWebSocket(gateway) as first, RawWebSocket(gateway) as second:
+        for ws in (first, second):
             ws.call("touch", PARAMETERS["touch"])
             assert ws.response()["result"] == {}
         leaving, staying = daemon.callers
         with daemon.holding():
-            one.call("arm", PARAMETERS["arm"])
+            first.call("arm", PARAMETERS["arm"])
             wait_for(lambda: "arm" in daemon.methods)
-            one.call("stop", {})
-            one.connection.close()
+            first.call("stop", {})
+            first.connection.close()
             wait_for(lambda: leaving.has_left and "stop" in daemon.methods)
         wait_for(lambda: not leaving.is_open)
         assert staying.is_open
-        other.call("effects", {}, id=2)
-        assert other.response(2)["result"]
+        second.call("effects", {}, id=2)
+        assert second.response(2)["result"]
 
 
 def test_websocket_receives_the_field_of_the_drive(
@@ -482,10 +482,10 @@ def test_websocket_receives_the_field_of_the_drive(
             assert opcode != 8, payload
             if opcode == 2 and struct.unpack_from("<H", payload, 4) == (1,):
                 break
-    found = decoded(payload)
-    assert (found.frequencies, found.layers) == ((10.0,), (2,))
-    assert found.thresholds == pytest.approx((0.0788,))  # by the set's file
-    (strength,) = np.abs(found.fields)
+    field = decoded(payload)
+    assert (field.frequencies, field.layers) == ((10.0,), (2,))
+    assert field.thresholds == pytest.approx((0.0788,))  # by the set's file
+    (strength,) = np.abs(field.fields)
     assert strength.shape[1] > strength.shape[0] > 2  # columns along the length
     south_west, south_east, north_west = strength[0, 0], strength[0, -1], strength[-1, 0]
     assert south_west == strength.max()

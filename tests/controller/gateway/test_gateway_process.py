@@ -92,8 +92,8 @@ def test_gateway_serves_outside_the_loopback_by_its_key(
     with gateway_process(tmp_path, daemon.socket, *outside) as gateway:
         assert gateway.url.startswith("http://localhost:")
         wait_for_daemon(gateway)
-        for more, status in ((["Origin: http://evil.example"], 403), ([], 200)):
-            assert http(gateway, more=more).status == status
+        for headers, status in ((["Origin: http://evil.example"], 403), ([], 200)):
+            assert http(gateway, more=headers).status == status
         for token, status in (([], 401), ([TOKEN], 200)):
             assert http(gateway, token=token).status == status
             read = http(gateway, "/metrics", method="GET", body=b"", token=token)
@@ -110,22 +110,22 @@ def test_gateway_prints_an_ipv6_url_with_a_random_token(
     daemon: ScriptedDaemon, tmp_path: Path
 ) -> None:
     """Of the loopback, in brackets; other hosts are refused, and tokens of other gateways."""
-    other = GatewaySettings(socket=tmp_path).token
+    another_token = GatewaySettings(socket=tmp_path).token
     with gateway_process(tmp_path, daemon.socket, "--listen", "[::1]:0", token=None) as gateway:
         assert gateway.url.startswith("http://[::1]:")
         token = [gateway.token]
         wait_for(lambda: http(gateway, token=token).status == 200)
         assert http(gateway, token=token, more=[f"Origin: http://{gateway.host}"]).status == 200
         assert http(gateway, token=token, host=["evil.example"]).status == 421
-        assert http(gateway, token=[other]).status == 401
-        assert len({gateway.token, other, GatewaySettings(socket=tmp_path).token}) == 3
-        assert len(gateway.token) == len(other) == 43  # 256 bits
+        assert http(gateway, token=[another_token]).status == 401
+        assert len({gateway.token, another_token, GatewaySettings(socket=tmp_path).token}) == 3
+        assert len(gateway.token) == len(another_token) == 43  # 256 bits
 
 
 def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
     """With the port, the reason and the option; a demonstration with its own, at once."""
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
         with pytest.raises(InputError, match=rf"port {port} \(Address already in use\).*--listen"):
             listening_socket(GatewaySettings(socket=tmp_path / "era.sock", port=port))
         page = f"127.0.0.1:{port}"
@@ -181,8 +181,8 @@ SETTINGS: dict[str, tuple[dict[str, object], str]] = {
     "host of an address with a zone": ({"extra_hosts": ("[fe80::1%eth0]",)}, "--allow-host"),
     "host by the end of an address": ({"extra_hosts": ("192.168.7",)}, "--allow-host"),
     **{
-        f"origin {each}": ({"origins": (each,)}, "--allow-origin must be scheme, host")
-        for each in (
+        f"origin {case}": ({"origins": (case,)}, "--allow-origin must be scheme, host")
+        for case in (
             *("https://panel.example/", "https://panel.example:0", "https://panel.example:65536"),
             *("https://me@panel.example", "https://panel..example", "https://*.example"),
             *("https://[panel]", "https://192.168.1", "https://stra\xdfe.example", "https://:443"),
@@ -194,13 +194,13 @@ SETTINGS: dict[str, tuple[dict[str, object], str]] = {
 @pytest.mark.parametrize("name", SETTINGS)
 def test_settings_refuse_what_is_unsafe(name: str) -> None:
     """Before anything listens, with the option to change."""
-    given, words = SETTINGS[name]
+    options, words = SETTINGS[name]
     with pytest.raises(InputError, match=words):
-        GatewaySettings(socket=Path("era.sock"), **given)  # type: ignore[arg-type]
+        GatewaySettings(socket=Path("era.sock"), **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("given", "sent"),
+    ("origin", "sent"),
     [
         ("https://plate.local:443", "https://plate.local"),
         ("http://plate.local:80", "http://plate.local"),
@@ -211,11 +211,11 @@ def test_settings_refuse_what_is_unsafe(name: str) -> None:
         ("https://[2001:DB8:0:0::7]:443", "https://[2001:db8::7]"),
     ],
 )
-def test_allowed_origin_is_as_browsers_send_it(given: str, sent: str) -> None:
+def test_allowed_origin_is_as_browsers_send_it(origin: str, sent: str) -> None:
     """By the serialization of an origin (RFC 6454, 6.2) and the host parser of the URL standard."""
     settings = GatewaySettings(
         socket=Path("era.sock"),
-        origins=(given,),
+        origins=(origin,),
         extra_hosts=("B\xfccher.example", "[2001:DB8::07]"),
     )
     assert settings.allowed_origins == {sent}
@@ -327,8 +327,8 @@ def proxied(
     folder = proxy.certificate.parent
     begin = {"caddy": "panel.local:8443 {", "nginx": "server {"}[program]
     site = rf"^    {re.escape(begin)}\n(?:^(?:     .*|    }})\n)+"
-    (found,) = re.findall(site, PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    lines = "\n".join(line for line in found.splitlines() if not re.search(without, line))
+    (section,) = re.findall(site, PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    lines = "\n".join(line for line in section.splitlines() if not re.search(without, line))
     lines = re.sub(r"/etc/\w+/panel", str(folder / "panel"), lines)
     lines = lines.replace("8138", str(behind.port)).replace("8443", str(proxy.port))
     config = folder / program
@@ -361,9 +361,9 @@ def proxied(
 def behind(daemon: ScriptedDaemon, tmp_path: Path, proxy: Proxy) -> Iterator[GatewayProcess]:
     """A gateway for the pages of the proxy."""
     allowed = ("--allow-host", "localhost", "--allow-origin", proxy.url.removesuffix("/"))
-    with gateway_process(tmp_path, daemon.socket, *allowed) as made:
-        wait_for_daemon(made)
-        yield made
+    with gateway_process(tmp_path, daemon.socket, *allowed) as process:
+        wait_for_daemon(process)
+        yield process
 
 
 def status(panel: GatewayProcess, request: bytes) -> bytes:
@@ -380,10 +380,10 @@ def test_gateway_is_used_through_a_proxy(
 ) -> None:
     """Page, methods and WebSocket with the key; none without it, or for foreign pages or hosts."""
     with proxied(program, proxy, behind) as panel:
-        own = [f"Origin: {proxy.url.removesuffix('/')}"]
+        origin = [f"Origin: {proxy.url.removesuffix('/')}"]
         assert b"<!doctype html>" in http(panel, "/", method="GET", body=b"").body.lower()
-        assert http(panel, more=own).status == 200
-        assert http(panel, token=[], more=own).status == 401
+        assert http(panel, more=origin).status == 200
+        assert http(panel, token=[], more=origin).status == 401
         with RawWebSocket(panel) as browser:
             browser.call("stop", {})
             assert browser.response()["result"]
@@ -417,23 +417,23 @@ def test_stops_are_passed_on_although_other_hosts_connect_often(
 
         def sent(method: str, host: str) -> socket.socket:
             """A connection of a host over which one request was sent."""
-            made = opened.enter_context(
+            process = opened.enter_context(
                 socket.create_connection(
                     ("127.0.0.1", gateway.port), timeout=PATIENCE, source_address=(host, 0)
                 )
             )
-            made.sendall(
+            process.sendall(
                 f"POST /api/v1/{method} HTTP/1.1\r\nHost: {gateway.host}\r\nConnection: close\r\n"
                 f"Authorization: Bearer {TOKEN}\r\nContent-Length: 0\r\n\r\n".encode()
             )
-            return made
+            return process
 
         for _ in range(45):
             for host in ("127.0.0.2", "127.0.0.3"):
                 sent("status", host)
-        asked = [sent("stop", "127.0.0.4") for _ in range(70)]
-        asked += [sent("disarm", "127.0.0.4") for _ in range(20)]
-        assert {each.recv(1 << 16)[9:12] for each in asked} == {b"200"}
+        requests = [sent("stop", "127.0.0.4") for _ in range(70)]
+        requests += [sent("disarm", "127.0.0.4") for _ in range(20)]
+        assert {connection.recv(1 << 16)[9:12] for connection in requests} == {b"200"}
         assert (daemon.methods.count("stop"), daemon.methods.count("disarm")) == (70, 20)
 
 
@@ -450,9 +450,9 @@ async def serving(daemon: Path) -> AsyncIterator[int]:
         await running
 
 
-def head_of(method: str, target: str, *more: str) -> bytes:
+def head_of(method: str, target: str, *headers: str) -> bytes:
     """A request of a client that has the token, without a body."""
-    lines = [f"{method} {target} HTTP/1.1", "Host: localhost", *more]
+    lines = [f"{method} {target} HTTP/1.1", "Host: localhost", *headers]
     return "\r\n".join([*lines, f"Authorization: Bearer {TOKEN}", "", ""]).encode()
 
 
@@ -573,8 +573,8 @@ def full_queue(tmp_path: Path) -> Iterator[Path]:
             except BlockingIOError:
                 break
         yield path
-        for each in waiting:
-            each.close()
+        for connection in waiting:
+            connection.close()
 
 
 async def test_stop_is_answered_although_the_daemon_hangs(
@@ -597,13 +597,13 @@ async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
     shared = connections.Connections(full_queue)
 
     def request(*, leaves: bool = True) -> "asyncio.Task[object]":
-        made = connections.ClientConnection(Mock(), shared)
+        client = connections.ClientConnection(Mock(), shared)
         transport = Mock(is_closing=lambda: False, get_extra_info=lambda _: ("192.0.2.1", 1))
-        made.connection_made(transport)
-        task = asyncio.create_task(made.request("status", Empty()))
+        client.connection_made(transport)
+        task = asyncio.create_task(client.request("status", Empty()))
         if leaves:
-            asyncio.get_running_loop().call_soon(made.connection_lost, None)
-        made.admit()
+            asyncio.get_running_loop().call_soon(client.connection_lost, None)
+        client.admit()
         return task
 
     waiting = [request() for _ in range(connections.MAX_KEPT)]
@@ -622,27 +622,27 @@ async def test_connection_that_waits_is_closed(tmp_path: Path) -> None:
     None before what has come of it is read, and those that had an answer before new ones.
     """
     shared = connections.Connections(tmp_path)
-    made = [
+    handlers = [
         connections.ClientConnection(Mock(), shared) for _ in range(connections.MAX_WAITING + 3)
     ]
-    wires = [Mock(is_closing=lambda: False) for _ in made]
-    for each, wire in zip(made, wires, strict=True):
-        each.connection_made(wire)
+    wires = [Mock(is_closing=lambda: False) for _ in handlers]
+    for handler, wire in zip(handlers, wires, strict=True):
+        handler.connection_made(wire)
 
     def closed() -> list[int]:
         return [number for number, wire in enumerate(wires) if wire.abort.called]
 
-    made[4].admit()
-    made[4].finish()  # answered
+    handlers[4].admit()
+    handlers[4].finish()  # answered
     assert closed() == []
     await asyncio.sleep(0.01)
     assert closed() == [0, 1, 4]
-    made[-2].admit()  # its request has come
+    handlers[-2].admit()  # its request has come
     await asyncio.sleep(4.9)
-    received(made[-1], b"G")
+    received(handlers[-1], b"G")
     assert closed() == [0, 1, 4]
     await asyncio.sleep(0.2)
-    assert closed() == [each for each in range(len(made)) if each != len(made) - 2]
+    assert closed() == [handler for handler in range(len(handlers)) if handler != len(handlers) - 2]
 
 
 async def test_request_is_not_handed_on_if_its_connection_is_lost_as_its_turn_comes(

@@ -452,7 +452,8 @@ def test_bash_completes_commands_and_options(typed: str, words: set[str]) -> Non
     *earlier_words, last = typed.split()
     script = (
         'script=$(era --show-completion) && eval "$script" && '
-        f"COMP_WORDS=({typed}) COMP_CWORD={len(earlier_words)} && _era_completion era {last} {earlier_words[-1]} "
+        f"COMP_WORDS=({typed}) COMP_CWORD={len(earlier_words)} && "
+        f"_era_completion era {last} {earlier_words[-1]} "
         '&& echo "${COMPREPLY[@]}"'
     )
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])

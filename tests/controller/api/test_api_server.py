@@ -125,7 +125,7 @@ def long_turns(one_line_a_turn: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @in_virtual_time
 async def test_server_continues_after_invalid_lines() -> None:
-    """Lines that are no JSON, no request, or wrong requests get an error each; the next is served."""
+    """Each invalid line gets an error; the line after it is served."""
     api = timed_api()
     client = MemoryClient(api)
 

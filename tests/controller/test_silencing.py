@@ -6,10 +6,10 @@
 import asyncio
 import json
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pytest
 from hypothesis import given
@@ -38,6 +38,15 @@ LONG_TEXTS = {
     "DEPTH": "[" * 600 + "]" * 600,
     "LENGTH": "x" * 70_000,
 }
+"""Texts in place of these words in the file."""
+
+
+def filled(text: str, method: str) -> str:
+    """A text of the file with a method and long texts in it."""
+    for name, long_text in LONG_TEXTS.items():
+        text = text.replace(name, long_text)
+    escaped = "".join(rf"\u{ord(letter):04x}" for letter in method)
+    return text.replace("METHOD", method).replace("ESCAPED", escaped)
 
 
 @dataclass
@@ -50,11 +59,7 @@ class Form:
 
     def line_of(self, method: str) -> bytes:
         """The request in one line, without its line feed."""
-        text = self.line.replace("PARAMS", self.params)
-        for name, long_text in LONG_TEXTS.items():
-            text = text.replace(name, long_text)
-        escaped = "".join(rf"\u{ord(letter):04x}" for letter in method)
-        return text.replace("METHOD", method).replace("ESCAPED", escaped).encode()
+        return filled(self.line.replace("PARAMS", self.params), method).encode()
 
     def body_of(self, method: str) -> bytes:
         """The parameters as a body, or the whole request where that is what is wrong."""
@@ -71,10 +76,11 @@ class Form:
         return params if is_given else None
 
 
-FORMS = {
-    name: Form(**keys)
-    for name, keys in read_yaml(Path(__file__).with_name("silencing.yaml")).items()
-}
+CASES = dict(read_yaml(Path(__file__).with_name("silencing.yaml")))
+FORMS = {name: Form(**values) for name, values in CASES["requests"].items()}
+HTTP_FORMS: dict[str, dict[str, Any]] = CASES["http"]
+FRAMES: dict[str, dict[str, Any]] = CASES["frames"]
+JSON_TYPE = "Content-Type: application/json"
 
 
 @dataclass
@@ -96,26 +102,40 @@ class Place:
                 return str(json.loads(received.readline())["error"]["message"])
 
     def post(
-        self, method: str, body: bytes, *, head: str = "", request: str = "", closes: bool = False
+        self,
+        method: str,
+        body: bytes,
+        *,
+        request: str = "POST /api/v1/METHOD HTTP/1.1",
+        head: Sequence[str] = (),
+        closes: bool = False,
     ) -> tuple[int, str]:
         """Status and error of the gateway; head: in place of type and length of the body."""
-        request = request or f"POST /api/v1/{method} HTTP/1.1"
-        head = head or f"Content-Type: application/json\r\nContent-Length: {len(body)}"
-        credentials = f"Host: {self.gateway.host}\r\nAuthorization: Bearer {TOKEN}"
+        lines = [
+            request.replace("METHOD", method),
+            f"Host: {self.gateway.host}",
+            f"Authorization: Bearer {TOKEN}",
+            *(head or [JSON_TYPE, f"Content-Length: {len(body)}"]),
+        ]
         with self.gateway.connect() as connection:
-            connection.sendall(f"{request}\r\n{credentials}\r\n{head}\r\n\r\n".encode() + body)
+            connection.sendall("\r\n".join([*lines, "", ""]).encode() + body)
             if closes:
                 connection.shutdown(socket.SHUT_WR)
             with connection.makefile("rb") as received:
                 status = int(received.readline().split()[1])
-                length = 0
-                while (line := received.readline().strip()) != b"":
-                    name, _, value = line.partition(b": ")
-                    if name.lower() == b"content-length":
-                        length = int(value)
-                content = json.loads(received.read(length))
+                content = json.loads(received.read(read_length(received)))
                 assert not closes or received.read() == b""  # the gateway has closed, too
         return status, content.get("error", "")
+
+
+def read_length(received: BinaryIO) -> int:
+    """Read a head to its end; the length of the body."""
+    length = 0
+    while line := received.readline().strip():
+        name, _, value = line.partition(b": ")
+        if name.lower() == b"content-length":
+            length = int(value)
+    return length
 
 
 @pytest.fixture(scope="module")
@@ -207,45 +227,25 @@ def test_request_that_silences_is_carried_out_whatever_is_wrong_with_it(
     place: Place, transport: str, method: str
 ) -> None:
     """Once, with those of its parameters that can be read; then its error is reported."""
-    failures: dict[str, object] = {}
+    has_arguments = transport.endswith("client")
+    is_http = transport.endswith("http")
     for name, form in FORMS.items():
-        if transport.endswith("client") and form.arguments is None:
+        if has_arguments and form.arguments is None:
             continue
         place.daemon.calls.clear()
+
         error = TRANSPORTS[transport](place, form, method)
+
         wait_for(lambda: place.daemon.calls, timeout=PROMPT)
         ((called, params),) = place.daemon.calls
         assert isinstance(params, RequestedBy)
         client = form.client
-        if transport.endswith("http") and (client is None or form.params == "{}"):
+        if is_http and (client is None or form.params == "{}"):
             client = "http 127.0.0.1"  # of a body that has no name where parameters have it
-        is_named = str(params.client).rpartition(":")[0] == client or params.client == client
-        if called != method or not is_named or not error:
-            failures[name] = (called, params, error)
-    assert failures == {}
-
-
-MEDIA = "Content-Type: application/json\r\n"
-HTTP_FORMS: dict[str, tuple[dict[str, Any], int]] = {
-    "a form's content type": (
-        {"head": "Content-Type: application/x-www-form-urlencoded\r\nContent-Length: 6"},
-        415,
-    ),
-    "text": ({"head": "Content-Type: text/plain\r\nContent-Length: 6"}, 415),
-    "no content type": ({"head": "Content-Length: 6"}, 415),
-    "chunks": (
-        {"head": MEDIA + "Transfer-Encoding: chunked", "body": b"6\r\n{    }\r\n0\r\n\r\n"},
-        411,
-    ),
-    "a body that is too long": ({"head": MEDIA + "Content-Length: 100000000"}, 413),
-    "a body that does not come": (
-        {"head": MEDIA + "Content-Length: 100", "closes": True},
-        408,
-    ),
-    "HTTP/2.0": ({"request": "POST /api/v1/METHOD HTTP/2.0"}, 505),
-    "GET": ({"request": "GET /api/v1/METHOD HTTP/1.1", "head": "Accept: */*", "body": b""}, 405),
-    "PUT": ({"request": "PUT /api/v1/METHOD HTTP/1.1"}, 405),
-}
+        assert called == method, name
+        assert error, name
+        names = (params.client, str(params.client).rpartition(":")[0])  # the gateway adds a port
+        assert client in names, name
 
 
 @pytest.mark.parametrize("method", sorted(SILENCING))
@@ -254,18 +254,19 @@ def test_http_request_that_silences_is_carried_out_however_it_is_sent(
     place: Place, name: str, method: str
 ) -> None:
     """If its host, origin and token are right; then its error is reported."""
-    changes, status = HTTP_FORMS[name]
-    sent = {"body": b"{    }"} | changes
-    if "request" in sent:
-        sent["request"] = sent["request"].replace("METHOD", method)
+    form = {"body": "{    }", **HTTP_FORMS[name]}
+    status = form.pop("status")
+    body = form.pop("body").encode()
     place.daemon.calls.clear()
-    assert place.post(method, **sent)[0] == status
+
+    assert place.post(method, body, **form)[0] == status
+
     assert place.daemon.methods == [method]
 
 
 def test_stop_does_not_wait_for_its_body(place: Place) -> None:
     """Which only names its client; it is answered once the body has come."""
-    head = f"POST /api/v1/stop HTTP/1.1\r\nHost: {place.gateway.host}\r\n{MEDIA}"
+    head = f"POST /api/v1/stop HTTP/1.1\r\nHost: {place.gateway.host}\r\n{JSON_TYPE}\r\n"
     place.daemon.calls.clear()
     with place.gateway.connect() as connection:
         connection.sendall(f"{head}Authorization: Bearer {TOKEN}\r\n".encode())
@@ -276,30 +277,18 @@ def test_stop_does_not_wait_for_its_body(place: Place) -> None:
     assert place.daemon.methods == ["stop"]
 
 
-FRAMES: dict[str, tuple[bytes, int, int]] = {
-    "binary": (b'{"jsonrpc": "2.0", "id": 1, "method": "METHOD"}', 0x82, 1003),
-    "two lines": (b'{"jsonrpc": "2.0",\n "id": 1, "method": "METHOD"}', 0x81, 1003),
-    "a line feed behind it": (b'{"jsonrpc": "2.0", "id": 1, "method": "METHOD"}\n', 0x81, 1003),
-    "not UTF-8": (b'{"method": "METHOD", "params": {"client": "\xff"}}', 0x81, 1007),
-    "the method behind 64 KiB": (
-        b'{"params": {"client": "' + b"x" * 70_000 + b'"}, "method": "METHOD"}',
-        0x81,
-        1009,
-    ),
-}
-
-
 @pytest.mark.parametrize("method", sorted(SILENCING))
 @pytest.mark.parametrize("name", FRAMES)
 def test_frame_that_silences_is_carried_out_before_it_is_refused(
     place: Place, name: str, method: str
 ) -> None:
     """The WebSocket is closed with the code of the refusal."""
-    frame, first, code = FRAMES[name]
+    frame = FRAMES[name]
+    payload = filled(frame["payload"], method).encode("latin-1")
     place.daemon.calls.clear()
     with RawWebSocket(place.gateway) as browser:
-        browser.send(frame.replace(b"METHOD", method.encode()), first=first)
-        assert browser.close_code() == code
+        browser.send(payload, first=0x82 if frame.get("is_binary") else 0x81)
+        assert browser.close_code() == frame["code"]
     wait_for(lambda: place.daemon.methods == [method], timeout=PROMPT)
 
 
@@ -348,11 +337,16 @@ def test_disarm_is_restricted_to_its_lease_whatever_else_is_wrong(place: Place) 
 
 TEXT = st.text(st.characters(codec="utf-8"), max_size=8)
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | FLOATS | TEXT,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT, inner, max_size=3),
-    max_leaves=6,
-)
+SCALARS = st.none() | st.booleans() | st.integers() | FLOATS | TEXT
+
+
+def nested(values: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
+    """Lists and objects of JSON values."""
+    lists = st.lists(values, max_size=3)
+    return lists | st.dictionaries(TEXT, values, max_size=3)
+
+
+VALUES = st.recursive(SCALARS, nested, max_leaves=6)
 KEYS = TEXT | st.sampled_from(["jsonrpc", "id", "params", "method"])
 
 
@@ -367,10 +361,10 @@ def test_any_object_whose_method_silences_silences(
     method: str, members: dict[str, Any], batch: list[Any], is_batch: bool, position: int
 ) -> None:
     """Whatever else it has, and whatever else is in its batch; it is called once."""
-    pairs = [*members.items()]
-    pairs = [pair for pair in pairs if pair[0] != "method"]
+    pairs = [pair for pair in members.items() if pair[0] != "method"]
     pairs.insert(position, ("method", method))
-    document: Any = [*batch, dict(pairs)] if is_batch else dict(pairs)
+    request = dict(pairs)
+    document = [*batch, request] if is_batch else request
     line = json.dumps(document).encode() + b"\n"
 
     async def served() -> list[str]:
@@ -385,12 +379,14 @@ def test_any_object_whose_method_silences_silences(
 @given(st.dictionaries(KEYS, VALUES, max_size=5))
 def test_no_other_object_silences(members: dict[str, Any]) -> None:
     """Nor does one whose parameters name a method that does."""
+    members.pop("method", None)
     for params in (members.get("params"), {"method": "stop"}, [{"method": "disarm"}]):
+        documents = [members | {"params": params}]
         for method in ("touch", "Stop", None, ["stop"], {"method": "stop"}):
-            document = members | {"method": method, "params": params}
-            assert read_silencing(json.dumps(document).encode()) is None
-        members.pop("method", None)
-        assert read_silencing(json.dumps(members | {"params": params}).encode()) is None
+            documents.append(members | {"method": method, "params": params})
+        for document in documents:
+            line = json.dumps(document).encode()
+            assert read_silencing(line) is None, line
 
 
 def test_every_parameter_of_a_method_that_silences_is_optional() -> None:

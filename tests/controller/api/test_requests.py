@@ -70,39 +70,53 @@ def test_server_reads_what_a_client_has_written(params: ApiMessage) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "code"),
+    "line",
     [
-        (b"", ErrorCode.PARSE),
-        (b"hello", ErrorCode.PARSE),
-        (b"\xff\xfe", ErrorCode.PARSE),
-        (b'{"jsonrpc":"2.0","id":1,"method":"stop"', ErrorCode.PARSE),
-        (b'{"jsonrpc":"2.0","id":1,"method":"\\ud800"}', ErrorCode.INVALID_REQUEST),
-        (
-            request("touch", '{"source":"a","touches":[{"id":1,"x_m":NaN,"y_m":0}]}', id=1),
-            ErrorCode.PARSE,
-        ),
-        (request("arm", '{"owner":"me","lease_s":Infinity}', id=1), ErrorCode.PARSE),
-        (b"[" * 60_000, ErrorCode.PARSE),
-        (b"1", ErrorCode.INVALID_REQUEST),
-        (b"[]", ErrorCode.INVALID_REQUEST),
-        (b'[{"jsonrpc":"2.0","id":1,"method":"stop"}]', ErrorCode.INVALID_REQUEST),
-        (b"{}", ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"1.0","id":1,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1,"method":7}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1.5,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":true,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (request("stop", id="1" + "0" * 4000), ErrorCode.INVALID_REQUEST),
-        (request("stop", id=f'"{"i" * 81}"'), ErrorCode.INVALID_REQUEST),
-        (request("stop", "[1]", id=1), ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":1,"method":"stop","more":1}', ErrorCode.INVALID_REQUEST),
+        b"",
+        b"hello",
+        b"\xff\xfe",
+        b'{"jsonrpc":"2.0","id":1,"method":"stop"',
+        b'{"jsonrpc":"2.0","id":1,"method":"touch","params":{"touches":[{"x_m":NaN}]}}',
+        b'{"jsonrpc":"2.0","id":1,"method":"arm","params":{"lease_s":Infinity}}',
+        pytest.param(b"[" * 60_000, id="deep"),
     ],
 )
-def test_line_that_is_no_request_is_refused(line: bytes, code: ErrorCode) -> None:
-    """-32700 for invalid JSON, -32600 for JSON that is not one request with named parameters."""
+def test_line_that_is_no_json_is_refused(line: bytes) -> None:
+    """With the code -32700 of JSON-RPC 2.0 and a remedy."""
     with pytest.raises(RpcError) as caught:
         read_request(line)
-    assert caught.value.code is code
+    assert caught.value.code is ErrorCode.PARSE
+    assert caught.value.data.remedy
+
+
+LONG_ID = "i" * 81
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1",
+        "[]",
+        '[{"jsonrpc":"2.0","id":1,"method":"stop"}]',
+        "{}",
+        '{"jsonrpc":"1.0","id":1,"method":"stop"}',
+        '{"jsonrpc":"2.0","id":1}',
+        '{"jsonrpc":"2.0","id":1,"method":7}',
+        '{"jsonrpc":"2.0","id":1,"method":"\\ud800"}',
+        '{"jsonrpc":"2.0","id":1.5,"method":"stop"}',
+        '{"jsonrpc":"2.0","id":true,"method":"stop"}',
+        f'{{"jsonrpc":"2.0","id":{10**4000},"method":"stop"}}',
+        f'{{"jsonrpc":"2.0","id":"{LONG_ID}","method":"stop"}}',
+        '{"jsonrpc":"2.0","id":1,"method":"stop","params":[1]}',
+        '{"jsonrpc":"2.0","id":1,"method":"stop","more":1}',
+    ],
+    ids=lambda line: line[:60],
+)
+def test_json_that_is_no_request_is_refused(line: str) -> None:
+    """With the code -32600 unless it is one request with named parameters; with a remedy."""
+    with pytest.raises(RpcError) as caught:
+        read_request(line.encode())
+    assert caught.value.code is ErrorCode.INVALID_REQUEST
     assert caught.value.data.remedy
 
 
@@ -158,8 +172,9 @@ def test_parameter_that_is_wrong_is_refused_with_its_key(
     method: str, params: str, key: str
 ) -> None:
     """-32602 and the key of what is missing, unknown, of another type or out of range."""
+    example = read_request(request(method, params, id=1))
     with pytest.raises(RpcError) as caught:
-        read_params(METHODS[method].params, read_request(request(method, params, id=1)))
+        read_params(METHODS[method].params, example)
     assert caught.value.code is ErrorCode.INVALID_PARAMS
     assert caught.value.data.where == key
     assert caught.value.data.remedy

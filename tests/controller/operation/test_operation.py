@@ -92,11 +92,13 @@ def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
     for operation in operations(state):
         next_state = DaemonState(STATE_CODES.get(code, state))
         actions = [Action[ACTION_CODES[letter]] for letter in letters]
-        if state is DaemonState.NOT_READY and trigger is Trigger.OPENED and operation.is_latched:
+        is_opened = (state, trigger) == (DaemonState.NOT_READY, Trigger.OPENED)
+        if is_opened and operation.is_latched:
             next_state = DaemonState.QUICK_STOP_ACTIVE
             actions = [Action.STOP]
 
-        updated, performed = step(operation, DaemonEvent(trigger, "because", "do this"), LOST_AT)
+        event = DaemonEvent(trigger, "because", "do this")
+        updated, performed = step(operation, event, LOST_AT)
 
         assert (updated.state, [*performed]) == (next_state, actions)
         if updated.state is not state:
@@ -126,15 +128,17 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
 @pytest.mark.parametrize("state", DaemonState)
 def test_step_leaves_comm_lost_alone_when_reconnected(state: DaemonState) -> None:
     """For FAULT if anything is latched; in other states nothing changes."""
+    reconnection = DaemonEvent(Trigger.RECONNECTED)
     for operation in operations(state):
-        updated, actions = step(operation, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
+        updated, actions = step(operation, reconnection, ENERGISED_UNTIL)
 
         if state is not DaemonState.COMM_LOST:
             assert (updated, actions) == (operation, ())
         elif operation.is_latched:
             assert (updated.state, actions) == (DaemonState.FAULT, ())
         else:
-            assert (updated.state, actions) == (DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,))
+            assert updated.state is DaemonState.SWITCH_ON_DISABLED
+            assert actions == (Action.VERIFY,)
 
 
 @pytest.mark.parametrize("state", DaemonState)
@@ -142,9 +146,8 @@ def test_degraded_link_changes_no_state(state: DaemonState) -> None:
     """While armed, its cause becomes that of the state."""
     cause = "no reply" if state is DaemonState.OPERATION_ENABLED else "why"
 
-    degraded, actions = step(
-        Operation(state, "why"), DaemonEvent(Trigger.LINK_CHANGED, "no reply"), 0.0
-    )
+    change = DaemonEvent(Trigger.LINK_CHANGED, "no reply")
+    degraded, actions = step(Operation(state, "why"), change, 0.0)
 
     assert (degraded.state, degraded.cause, actions) == (state, cause, ())
 
@@ -163,6 +166,7 @@ def test_unexpected_exception_is_latched(state: DaemonState) -> None:
 
 def test_remedy_of_every_fault_of_an_amplifier_is_its_own() -> None:
     """Any other cause has the remedy to look for the cause."""
-    remedies = {fault_remedy(f"amplifier main: got FAULT with fault {name}") for name in FAULTS}
+    causes = [f"amplifier main: got FAULT with fault {name}" for name in FAULTS]
+    remedies = {fault_remedy(cause) for cause in causes}
     assert len(remedies) == len(FAULTS)
     assert fault_remedy("a bug") == fault_remedy("fault NONE")

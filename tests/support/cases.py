@@ -42,7 +42,7 @@ SLOWEST = (
     "test_daemon_faults_process.py",
     "test_calibrate.py",
     "test_application_page.py",
-    "test_daemon_inputs.py",
+    "test_free_loop.py",
     "test_host_rules.py",
     "test_identify.py",
     "test_firmware.py",

@@ -33,6 +33,7 @@ from controller.api.link import default_socket
 from drivers import opening
 from drivers.by_hand.actions import identify_amplifier
 from drivers.errors import CommandError, LinkError
+from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
@@ -241,7 +242,8 @@ def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -
         if name != "era-plate":
             assert "RestrictRealtime" not in texts[name]
             assert "@resources" not in texts[name]
-            assert all(allows(program, texts[name], call) for call in REAL_TIME)
+            for call in REAL_TIME:
+                assert allows(program, texts[name], call), (name, call)
     for predecessor, name in pairwise(AT_HOME):
         for key in ("Wants", "After"):
             assert f"\n{key}={predecessor}.service\n" in texts[name]
@@ -309,7 +311,8 @@ def test_page_commands_print_what_is_shown(name: str, tmp_path: Path, installed:
         site, programs = home / "site", home / "bin"
         programs.mkdir()
         words = [sys.executable, str(PIP), str(installed), str(site)]
-        (pip := programs / "pip").write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', "utf-8")
+        pip = programs / "pip"
+        pip.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', "utf-8")
         pip.chmod(0o755)
         with Reader(folder, home=home, programs=programs, site=site) as reader:
             for step in steps:
@@ -369,12 +372,10 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
     path = tmp_path / "line.sock"
     async with served_socket(path):
         lines = Lines()
-        amplifiers = {
-            str(number): await lines.amplifier(
-                f"example-unix://{path}#{number}", LIMITS, name=str(number)
-            )
-            for number in (1, 2)
-        }
+        amplifiers = dict[str, Amplifier]()
+        for name in ("1", "2"):
+            url = f"example-unix://{path}#{name}"
+            amplifiers[name] = await lines.amplifier(url, LIMITS, name=name)
         group = Group(amplifiers)
         await group.open()
         await group.arm()
@@ -382,7 +383,9 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
         await group.apply(dict.fromkeys(amplifiers, layers))
         statuses = [await amplifier.read_status() for amplifier in amplifiers.values()]
         assert [status["levels"] for status in statuses] == [[5000], [5000]]
-        assert all(amplifier.is_confirmed for amplifier in (await group.stop()).values())
+        outcomes = await group.stop()
+        confirmed = {name: outcome.is_confirmed for name, outcome in outcomes.items()}
+        assert confirmed == {"1": True, "2": True}
         amplifiers["1"].line._port.write(b"hang up")
         async with asyncio.timeout(60.0):
             with pytest.raises(LinkError, match="was lost"):

@@ -79,7 +79,8 @@ async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack,
     """
     text = (FOLDER / "plate.html").read_text(encoding="utf-8")
     assert text.count(GATEWAY) == 1
-    (folder := tmp_path / "page").mkdir()
+    folder = tmp_path / "page"
+    folder.mkdir()
     handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
     async with (
         Network().serving() as network,

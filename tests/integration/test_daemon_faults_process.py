@@ -214,8 +214,8 @@ async def test_daemon_replays_nothing_when_paused_longer_than_watchdog(tmp_path:
                     status = await era.status()
             await armed(era)
             await journal.hear(10)
-            sent = journal.raising_since(resumed)
-            assert all(entry.is_refused for entry in sent), sent
+            accepted = [entry for entry in journal.raising_since(resumed) if not entry.is_refused]
+            assert accepted == []
             assert loudness(far) == 0
 
 

@@ -91,7 +91,8 @@ class Truth:
         loads = list(self.resting(heard.situation).values())
         fields_of_eras = solve(drawn_rig.eras, frequencies, points, loads=loads)
         names = [era.name for era in self.rig.eras]
-        weights = np.zeros((len(frequencies), len(names)), dtype=complex)
+        shape = (len(frequencies), len(names))
+        weights = np.zeros(shape, dtype=complex)
         for name, tone in drive.items():
             row = int(np.searchsorted(frequencies, tone["frequency_hz"]))
             errors = self.drawn.channels[self.rig.wiring[name]]
@@ -130,7 +131,8 @@ def patterns_match_table(played: Played, truth: Truth) -> None:
             assert reported["frequency_hz"] == tone.frequency, name
             level = tone.amplitude / STROKE
             assert reported["level"] == pytest.approx(level, abs=0.51 * LEVEL_STEP), name
-            phase_error = math.remainder(reported["phase_deg"] - math.degrees(tone.phase), 360)
+            phase = math.degrees(tone.phase)
+            phase_error = math.remainder(reported["phase_deg"] - phase, 360)
             assert abs(phase_error) <= 0.51 * PHASE_STEP, name
         frequencies = {tone.frequency for tone in tones.values()}
         for place, felt in heard.steady.items():
@@ -164,7 +166,8 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
         situation = heard.situation
         target = heard.steady[situation.felt_at]
         frequencies = np.array(target.frequencies)
-        contacts = {contact["role"]: contact for contact in heard.patterns[-1]["contacts"]}
+        pattern = heard.patterns[-1]
+        contacts = {contact["role"]: contact for contact in pattern["contacts"]}
         contact = contacts["target"]
         assert contact["level_db_sl"] == pytest.approx(LEVEL_DB_SL, abs=1e-5)
         fields = dict[str, FloatArray]()
@@ -173,18 +176,19 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
             fields[place] = np.abs(field)
 
         level = mean_level_db_sl(frequencies, target.amplitude, target.weights)
-        solved_level = mean_level_db_sl(frequencies, fields[situation.felt_at], target.weights)
+        target_field = fields[situation.felt_at]
+        solved_level = mean_level_db_sl(frequencies, target_field, target.weights)
         assert level == pytest.approx(solved_level, abs=1), situation
 
         if situation.quiet:
-            assert contact["contrast_db"] == heard.patterns[-1]["predicted_contrast_db"]
+            assert contact["contrast_db"] == pattern["predicted_contrast_db"]
             felt_sums = {place: felt.amplitude.sum(axis=0) for place, felt in heard.steady.items()}
             contrast = _contrast(felt_sums, situation, target.weights)
             solved_sums = {place: field.sum(axis=0) for place, field in fields.items()}
             solved_contrast = _contrast(solved_sums, situation, target.weights)
             judged = min(contrast, JUDGED_UP_TO)
             assert judged == pytest.approx(min(solved_contrast, JUDGED_UP_TO), abs=1), situation
-            assert 3 < heard.patterns[-1]["promised_contrast_db"] <= contrast, situation
+            assert 3 < pattern["promised_contrast_db"] <= contrast, situation
 
 
 def with_knots(pattern: Layer, knots: int) -> Layer:
@@ -204,7 +208,8 @@ def predicted_peaks(truth: Truth, situation: Situation, pattern: Layer) -> dict[
     """
     drawn_rig = truth.drawn.plate.realised(truth.rig)
     footprints = footprints_of(drawn_rig.eras)
-    plant = Plant(reduce_plate(drawn_rig.plate, drawn_rig.mesh, footprints), drawn_rig.eras)
+    reduced = reduce_plate(drawn_rig.plate, drawn_rig.mesh, footprints)
+    plant = Plant(reduced, drawn_rig.eras)
     plant.set_contacts(truth.resting(situation))
     channels = truth.drawn.channels
     errors = {name: channels[channel] for name, channel in truth.rig.wiring.items()}
@@ -223,7 +228,8 @@ def predicted_peaks(truth: Truth, situation: Situation, pattern: Layer) -> dict[
     first = 0
     for place, disc in discs.items():
         samples_of_disc = samples[:, first : first + len(disc)]
-        peaks[place] = np.abs(felt_part(samples_of_disc, PLANT_SAMPLE_RATE)).max(axis=0)
+        felt = felt_part(samples_of_disc, PLANT_SAMPLE_RATE)
+        peaks[place] = np.abs(felt).max(axis=0)
         first += len(disc)
     return peaks
 
@@ -284,18 +290,16 @@ def no_rule_is_broken(played: Played, truth: Truth) -> None:
     assert not played.violations, played.violations[0]
 
 
-CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
-    check.__name__: check
-    for check in (
-        patterns_match_table,
-        plate_response_matches_model,
-        localization_matches_prediction,
-        onset_matches_prediction,
-        plate_decays,
-        all_is_off_in_the_end,
-        no_rule_is_broken,
-    )
-}
+Check = Callable[[Played, Truth], None]
+CHECKS: tuple[Check, ...] = (
+    patterns_match_table,
+    plate_response_matches_model,
+    localization_matches_prediction,
+    onset_matches_prediction,
+    plate_decays,
+    all_is_off_in_the_end,
+    no_rule_is_broken,
+)
 
 
 def _touched(played: Played) -> list[Heard]:
@@ -312,7 +316,8 @@ def _contrast(peaks: Mapping[str, FloatArray], situation: Situation, weights: Fl
     weights (p,): of the points in the mean over the target.
     """
     quiet = np.concatenate([peaks[place] for place in situation.quiet])
-    return float(contrast_db([peaks[situation.felt_at]], quiet, [weights]))
+    target = peaks[situation.felt_at]
+    return float(contrast_db([target], quiet, [weights]))
 
 
 PLACES = {
@@ -393,11 +398,11 @@ def played(truth: Truth, rig: Rig) -> Callable[[str], Played]:
 @pytest.mark.parametrize("check", CHECKS)
 @pytest.mark.parametrize("wire", shortly(WIRES, SHORTLY))
 def test_fingers_feel_the_commanded_pattern(
-    played: Callable[[str], Played], truth: Truth, wire: str, check: str
+    played: Callable[[str], Played], truth: Truth, wire: str, check: Check
 ) -> None:
     """Every check passes over every wire."""
     truth_on_wire = replace(truth, onset_knots=KNOTS.get(wire))
-    CHECKS[check](played(wire), truth_on_wire)
+    check(played(wire), truth_on_wire)
 
 
 @pytest.fixture(scope="module")
@@ -423,7 +428,7 @@ def test_amplifiers_take_turns(turns: tuple[Played, Truth]) -> None:
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_fingers_feel_the_commanded_pattern_over_two_wires(
-    turns: tuple[Played, Truth], check: str
+    turns: tuple[Played, Truth], check: Check
 ) -> None:
     """What holds over one wire holds where two amplifiers on two wires play together."""
-    CHECKS[check](*turns)
+    check(*turns)

@@ -63,18 +63,17 @@ ENERGISED_UNTIL = 0.35
 
 def read_table() -> dict[tuple[DaemonState, Trigger], str]:
     """The entries of the table by state and trigger."""
-    header, *rows = TABLE.strip().splitlines()
-    triggers = [Trigger[name] for name in header.split()]
-    table = dict[tuple[DaemonState, Trigger], str]()
-    for row in rows:
+    table = {}
+    for row in ROWS:
         state, *entries = row.split()
-        for trigger, entry in zip(triggers, entries, strict=True):
+        for trigger, entry in zip(TABLE_TRIGGERS, entries, strict=True):
             table[DaemonState(state), trigger] = entry
     return table
 
 
+HEADER, *ROWS = TABLE.strip().splitlines()
+TABLE_TRIGGERS = [Trigger[name] for name in HEADER.split()]
 ENTRIES = read_table()
-TABLE_TRIGGERS = sorted({trigger for _, trigger in ENTRIES}, key=[*Trigger].index)
 
 
 def operations(state: DaemonState) -> Sequence[Operation]:
@@ -88,7 +87,8 @@ def operations(state: DaemonState) -> Sequence[Operation]:
 @pytest.mark.parametrize("trigger", TABLE_TRIGGERS, ids=lambda trigger: trigger.name)
 def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
     """The next state and the actions are those of the table, whether a stop is latched or not."""
-    code, _, letters = ENTRIES[state, trigger].partition(":")
+    entry = ENTRIES[state, trigger]
+    code, _, letters = entry.partition(":")
     for operation in operations(state):
         next_state = DaemonState(STATE_CODES.get(code, state))
         actions = [Action[ACTION_CODES[letter]] for letter in letters]

@@ -46,7 +46,7 @@ SLOWEST = (
     "test_host_rules.py",
     "test_identify.py",
     "test_firmware.py",
-    "test_examples.py",
+    "test_how_to_pages.py",
     "test_conformance.py",
     "test_control_loop.py",
     "test_four_amplifiers.py",

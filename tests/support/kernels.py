@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 TESTS = (
     "tests/model",
     "tests/docs/test_pages.py",
-    "tests/examples/test_examples.py",
+    "tests/examples/test_how_to_pages.py",
     "tests/integration/test_four_amplifiers.py",
 )
 MAX_CONTRAST = 1e-3

@@ -147,7 +147,7 @@ late-test: .venv/installed-test
 
 # The Qt application of the examples with PySide6, without a screen.
 qt-test: .venv/installed-qt
-	$(BIN)/pytest -q tests/integration/test_people_at_a_plate.py
+	$(BIN)/pytest -q tests/integration/test_qt_application.py
 
 # The whole chain in virtual time, by as many seeds as 20 minutes allow; `make test` takes seven.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'

@@ -33,7 +33,7 @@ def moved(compiled: Path) -> Callable[..., Path]:
         sanitizers = os.environ.get("SANITIZERS", "undefined")
         flags = ("-O1", f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", *options)
         folder = compiled / "-".join(
-            ["moved", *(each.strip("-").replace("=", "") for each in options)]
+            ["moved", *(option.strip("-").replace("=", "") for option in options)]
         )
         return build_firmware(folder, "era-moved.so", f"CFLAGS={' '.join(flags)}")
 

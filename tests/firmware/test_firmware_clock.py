@@ -47,68 +47,93 @@ def built(rate: int, moved: Callable[..., Path]) -> Path:
     return moved() if rate == 16_000 else moved(f"-DSAMPLE_RATE={rate}")
 
 
-def seconds(firmware: MovedFirmware) -> float:
-    """The clock that its Status shows [s]."""
+def clock_of(firmware: MovedFirmware) -> float:
+    """Return the clock that its Status shows [s]."""
     return float(values_of(firmware, hand.GET_STATUS)["clock"] / 2**32 * TURN)
 
 
-def apart(clock: float, other: float) -> float:
-    """By how much a clock is ahead of another [s]."""
-    return (clock - other + TURN / 2) % TURN - TURN / 2
+def check_clock(firmware: MovedFirmware, expected: float, error: float = CLOCK_ERROR) -> None:
+    """Check that its clock is as expected [s], within an error and a number of turns."""
+    assert lead(clock_of(firmware), expected) == pytest.approx(0, abs=error)
 
 
-def arm(shift: int = 0, *, watchdog_ms: int = 2000, session: int = SESSION) -> bytes:
-    """An Arm that moves its clock on by steps of the high word."""
-    return request(hand.ARM, session, watchdog_ms, shift)
+def high_word_of(firmware: MovedFirmware) -> int:
+    """Return the high word of its clock."""
+    return int(values_of(firmware, hand.GET_STATUS)["clock"] >> 16)
 
 
-def staged(token: int, *layers: Sequence[int]) -> bytes:
-    """A set of one part, which waits for its commit."""
+def lead(clock: float, reference: float) -> float:
+    """Return by how much a clock is ahead of a reference [s]."""
+    return (clock - reference + TURN / 2) % TURN - TURN / 2
+
+
+def arm(shift: int = 0) -> bytes:
+    """Return an Arm that moves the clock on by steps of the high word."""
+    return request(hand.ARM, SESSION, 2000, shift)
+
+
+def stage(token: int, *layers: Sequence[int]) -> bytes:
+    """Return a set of one part, which waits for its commit."""
     return request(hand.SET, *hand.part(token, *layers, session=SESSION))
 
 
 def commit(token: int, at: int) -> bytes:
-    """A Commit for a moment."""
+    """Return a Commit for a high word of the clock."""
     return request(hand.COMMIT, SESSION, token, at % 65536)
 
 
+def first_sound(firmware: MovedFirmware) -> int:
+    """Return the index of the first sample of the first channel that is not 0."""
+    return int(np.flatnonzero(firmware.samples()[:, 0])[0])
+
+
 def test_clock_is_read_between_samples(rate: int, built: Path) -> None:
-    """At odd times it is a sample behind them, within what it states, and nothing is biased."""
+    """At odd times it is a sample behind them, within its stated error and without bias."""
     firmware = MovedFirmware(built)
-    assert values_of(firmware, hand.GET_CAPS)["clock_error"] == round(CLOCK_ERROR * 1e7)
-    off = []
+    capabilities = values_of(firmware, hand.GET_CAPS)
+    assert capabilities["clock_error"] == round(CLOCK_ERROR * 1e7)
+    errors = []
     for number in range(1, 300):
         time = round(0.00271828 * number, 6)
         firmware.move(time)
-        off.append(apart(seconds(firmware), time - 1 / rate))
-    assert max(map(abs, off)) < CLOCK_ERROR
-    assert abs(sum(off) / len(off)) < CLOCK_ERROR / 4
+        clock = clock_of(firmware)
+        errors.append(lead(clock, time - 1 / rate))
+
+    np.testing.assert_allclose(errors, 0, atol=CLOCK_ERROR)
+    assert np.mean(errors) == pytest.approx(0, abs=CLOCK_ERROR / 4)
 
 
 def test_clock_is_the_same_after_a_turn(built: Path) -> None:
     """20 s later, within its last bit of 5 ns: 6 hours add less than 5 us."""
     firmware = MovedFirmware(built)
     firmware.move(0.01)
-    clock = seconds(firmware)
+    clock = clock_of(firmware)
+
     firmware.move(0.01 + TURN)
-    assert abs(apart(seconds(firmware), clock)) <= TURN / 2**32
+
+    check_clock(firmware, clock, error=TURN / 2**32)
+
+
+def output_after(built: Path, *, buffered: int) -> tuple[float, int]:
+    """Return the clock [s] and the number of samples after 0.0987654 s."""
+    firmware = MovedFirmware(built, buffered=buffered)
+    firmware.move(0.0987654)
+    return clock_of(firmware), len(firmware.samples())
 
 
 @pytest.mark.parametrize("buffered", [1, 700])
-def test_clock_is_that_at_the_output(built: Path, buffered: int) -> None:
-    """Not that of samples which are made ahead, into a buffer: those are as many more."""
-    clocks, made = [], []
-    for ahead in (0, buffered):
-        firmware = MovedFirmware(built, buffered=ahead)
-        firmware.move(0.0987654)
-        clocks.append(seconds(firmware))
-        made.append(len(firmware.samples()))
-    assert abs(apart(*clocks)) < CLOCK_ERROR
-    assert made[1] - made[0] == buffered
+def test_clock_is_the_time_of_the_output(built: Path, buffered: int) -> None:
+    """Samples that are made ahead into a buffer do not count."""
+    clock, samples = output_after(built, buffered=0)
+    buffered_clock, buffered_samples = output_after(built, buffered=buffered)
+
+    assert lead(buffered_clock, clock) == pytest.approx(0, abs=CLOCK_ERROR)
+    extra_samples = buffered_samples - samples
+    assert extra_samples == buffered
 
 
 @pytest.mark.parametrize(
-    ("ping", "end"),
+    ("ping", "ending"),
     [
         (32767, request(hand.DISARM, 0)),
         (-32768, request(hand.STOP, 0)),
@@ -118,11 +143,11 @@ def test_clock_is_that_at_the_output(built: Path, buffered: int) -> None:
     ids=["disarmed", "stopped", "fault", "reset"],
 )
 def test_ping_sets_the_rate_until_it_is_disarmed(
-    built: Path, rate: int, ping: int, end: bytes
+    built: Path, rate: int, ping: int, ending: bytes
 ) -> None:
-    """Of 4 s it is ahead by as many tenths of a millionth; one of another session sets nothing.
+    """In 4 s it gains so many tenths of a millionth; a Ping of another session sets nothing.
 
-    Once it is not armed the rate is 0, and a Ping does not change that.
+    Once disarmed, the rate is 0, and a Ping does not change it.
     """
     firmware = MovedFirmware(built)
     firmware.receive(CAN, OPERATIONAL)
@@ -132,48 +157,53 @@ def test_ping_sets_the_rate_until_it_is_disarmed(
         firmware.receive(SERIAL, request(hand.PING, SESSION, ping))
         firmware.receive(SERIAL, request(hand.PING, SESSION + 1, -ping))
     firmware.move(4)
-    ahead = 4 * ping * 1e-7
-    assert apart(seconds(firmware), 4 + ahead) == pytest.approx(-1 / rate, abs=CLOCK_ERROR)
-    firmware.receive(CAN if end == RESET_NODE else SERIAL, end)
+    gained = 4 * ping * 1e-7
+    check_clock(firmware, 4 + gained - 1 / rate)
+
+    firmware.receive(CAN if ending == RESET_NODE else SERIAL, ending)
     firmware.move(7)
     firmware.receive(SERIAL, request(hand.PING, SESSION, ping))
-    since = seconds(firmware)
+    clock = clock_of(firmware)
     firmware.move(8)
-    assert apart(seconds(firmware), since) == pytest.approx(1, abs=CLOCK_ERROR)
+
+    check_clock(firmware, clock + 1)
 
 
-def test_arm_moves_the_clock_on_once(built: Path) -> None:
-    """By its shift of steps of 0.3 ms; the session that is held moves it no more."""
+def test_arm_shifts_the_clock_of_a_new_session_once(built: Path) -> None:
+    """By its shift of steps of 0.3 ms; the same session again shifts nothing."""
     firmware = MovedFirmware(built)
-    before = seconds(firmware)
+    expected = clock_of(firmware) + 40_000 * STEP
+
     for shift in (40_000, 7):
         firmware.receive(SERIAL, arm(shift))
-        assert apart(seconds(firmware), before + 40_000 * STEP) == pytest.approx(0, abs=1e-9)
+        check_clock(firmware, expected, error=1e-9)
 
 
-def test_voices_count_on_the_clock(rate: int, built: Path) -> None:
-    """Level x sin(2 pi f clock + phase), over the end of a turn, whatever was committed when.
+def test_voices_follow_the_clock(rate: int, built: Path) -> None:
+    """Level * sin(2 pi f clock + phase), across the end of a turn, whenever it was committed.
 
-    The clock begins a step before it goes round.
+    The clock starts one step before the end of a turn.
     """
     firmware = MovedFirmware(built)
     firmware.receive(SERIAL, arm(65535))
-    plays = [
-        (0.0001, (333.35, 0.3, 0.0)),
-        (0.01713, (100.0, 0.5, 90.0)),
-        (0.0331, (333.35, 0.4, -45.0)),
+    tones = [
+        (0.0001, 333.35, 0.3, 0.0),
+        (0.01713, 100.0, 0.5, 90.0),
+        (0.0331, 333.35, 0.4, -45.0),
     ]
-    for token, (time, tone) in enumerate(plays, 1):
+    for token, (time, frequency, level, phase) in enumerate(tones, 1):
         firmware.move(time)
-        firmware.receive(SERIAL, apply(token, hand.tone(0, *tone)))
+        tone = hand.tone(0, frequency, level, phase)
+        firmware.receive(SERIAL, apply(token, tone))
     firmware.move(0.05)
     samples = firmware.samples()[:, 0]
+
+    clock = np.arange(len(samples)) / rate - STEP
     expected = np.zeros(len(samples))
-    k = np.arange(len(samples))
-    for time, (frequency, level, phase) in plays:
+    for time, frequency, level, phase in tones:
         first = math.floor(round(time * rate, 6))
-        angle = 2 * np.pi * frequency * (k / rate - STEP) + np.radians(phase)
-        expected[first:] = level * np.sin(angle[first:])
+        angle = 2 * np.pi * frequency * clock[first:] + np.radians(phase)
+        expected[first:] = level * np.sin(angle)
     np.testing.assert_allclose(samples, expected, atol=6e-5)
 
 
@@ -182,64 +212,71 @@ def test_commit_starts_with_the_first_sample_of_its_moment(
     rate: int, built: Path, ahead: int
 ) -> None:
     """It counts as committed until then, and a repeated Commit changes nothing."""
-    firmware, shift = MovedFirmware(built), 65_500
+    firmware = MovedFirmware(built)
+    shift = 65_500
     firmware.receive(SERIAL, arm(shift))
     firmware.move(0.01234)
-    firmware.receive(SERIAL, staged(1, hand.layer(0, TONE, ramp=0)))
-    at = (values_of(firmware, hand.GET_STATUS)["clock"] >> 16) + ahead
-    firmware.receive(SERIAL, commit(1, at))
-    firmware.receive(SERIAL, commit(1, at + 50))
+    firmware.receive(SERIAL, stage(1, hand.layer(0, TONE, ramp=0)))
+    moment = high_word_of(firmware) + ahead
+    firmware.receive(SERIAL, commit(1, moment))
+    firmware.receive(SERIAL, commit(1, moment + 50))
     status = values_of(firmware, hand.GET_STATUS)
-    # The first sample at or behind the high word of the clock.
-    first = max(math.ceil((at - shift) % 65536 * 20 * rate / 65536), math.floor(0.01234 * rate))
-    assert (status["token"], status["tokens"][0]) == (1, 0 if ahead > 1 else status["tokens"][0])
+    assert status["token"] == 1
+    if ahead > 1:
+        assert status["tokens"][0] == 0
+
     firmware.move(0.6)
-    sounding = np.flatnonzero(firmware.samples()[:, 0])
-    assert sounding[0] == first
+
+    first_after_moment = math.ceil((moment - shift) % 65536 * 20 * rate / 65536)
+    first_after_commit = math.floor(0.01234 * rate)
+    assert first_sound(firmware) == max(first_after_moment, first_after_commit)
     assert values_of(firmware, hand.GET_STATUS)["tokens"][0] == 1
 
 
 @pytest.mark.parametrize("ahead", [0, 1639, -1, 32768])
-def test_commit_of_no_moment_ahead_starts_at_once(rate: int, built: Path, ahead: int) -> None:
-    """With the next sample: the present high word, one behind, and more than 0.5 s ahead."""
+def test_commit_for_no_moment_ahead_starts_immediately(rate: int, built: Path, ahead: int) -> None:
+    """With the next sample: the present high word, an earlier one, and more than 0.5 s ahead."""
     firmware = MovedFirmware(built)
     firmware.receive(SERIAL, arm())
     firmware.move(0.01234)
-    firmware.receive(SERIAL, staged(1, hand.layer(0, TONE, ramp=0)))
-    at = (values_of(firmware, hand.GET_STATUS)["clock"] >> 16) + ahead
-    firmware.receive(SERIAL, commit(1, at))
+    firmware.receive(SERIAL, stage(1, hand.layer(0, TONE, ramp=0)))
+
+    firmware.receive(SERIAL, commit(1, high_word_of(firmware) + ahead))
+
     firmware.move(0.02)
-    assert np.flatnonzero(firmware.samples()[:, 0])[0] == math.floor(0.01234 * rate)
+    assert first_sound(firmware) == math.floor(0.01234 * rate)
 
 
-def test_set_starts_though_a_layer_ends_at_its_moment(replaying: Path) -> None:
-    """Its voice goes on from its amplitude: keep phase, and 625 samples are 128 steps."""
+def test_set_starts_although_a_layer_ends_at_its_moment(replaying: Path) -> None:
+    """With keep_phase its voice continues from its amplitude; 625 samples are 128 steps."""
     firmware = MovedFirmware(replaying)
     firmware.receive(SERIAL, arm())
     firmware.move((625 * 4 - 32) / 16_000)
-    first = hand.layer(0, TONE, ramp=0, valid_for=2)  # 32 samples
-    firmware.receive(SERIAL, request(hand.SET, *hand.part(1, first, now=True)))
-    kept = hand.tone(0, 100, 0.5, 90, keep_phase=True)
-    firmware.receive(SERIAL, staged(2, hand.layer(0, kept, ramp=5)))
+    ending = hand.layer(0, TONE, ramp=0, valid_for=2)  # 32 samples
+    firmware.receive(SERIAL, request(hand.SET, *hand.part(1, ending, now=True)))
+    continued = hand.tone(0, 100, 0.5, 90, keep_phase=True)
+    firmware.receive(SERIAL, stage(2, hand.layer(0, continued, ramp=5)))
     firmware.receive(SERIAL, commit(2, 512))
+
     firmware.move(0.2)
-    samples = firmware.samples()[2500 - 32 :, 0]
-    k = np.arange(2500 - 32, 2500 - 32 + len(samples))
-    np.testing.assert_allclose(samples, 0.5 * np.cos(2 * np.pi * 100 * k / 16_000), atol=6e-5)
+
+    samples = firmware.samples()[:, 0]
+    times = np.arange(len(samples)) / 16_000
+    expected = 0.5 * np.cos(2 * np.pi * 100 * times)
+    np.testing.assert_allclose(samples[2468:], expected[2468:], atol=6e-5)
 
 
-_MODBUS = bytes([16]) + (256 * MARK).to_bytes(2, "big") + bytes([0, 1, 2, 0, 5])
 MARKS = {
     SERIAL: hand.frame(MARK, sequence=1, address=0),
-    MODBUS: framed(0, _MODBUS, is_rtu=True),
-    CAN: f"t2008{0:02X}{0:02X}{MARK:02X}{0:02X}00000000\r".encode(),
+    MODBUS: framed(0, bytes.fromhex("10 13 00 00 01 02 00 05"), is_rtu=True),
+    CAN: b"t20080000130000000000\r",
 }
-"""The broadcast on each line."""
+"""The broadcast of number 19 on each line."""
 
 
 @pytest.mark.parametrize("line", MARKS)
 def test_mark_keeps_the_clock_of_its_last_byte(replaying: Path, line: int) -> None:
-    """The next Status has it, once; on RTU the silence behind the frame does not count."""
+    """The next Status shows it once; on RTU the silence behind the frame does not count."""
     firmware = MovedFirmware(replaying)
     assert MESSAGES["Mark"].number == MARK
     firmware.receive(CAN, OPERATIONAL)
@@ -247,7 +284,10 @@ def test_mark_keeps_the_clock_of_its_last_byte(replaying: Path, line: int) -> No
     firmware.sent(line)
     firmware.receive(line, MARKS[line])
     firmware.move(0.05)
-    said = [each for each in firmware.sent(line).split(b"\r") if not each.startswith(b"t701")]
-    assert not any(said)  # but heartbeats
-    assert apart(seconds(firmware), 0.0123456 - 1 / 16_000) == pytest.approx(0, abs=CLOCK_ERROR)
-    assert apart(seconds(firmware), 0.05 - 1 / 16_000) == pytest.approx(0, abs=CLOCK_ERROR)
+
+    replies = firmware.sent(line).split(b"\r")
+    heartbeats = [reply for reply in replies if reply.startswith(b"t701")]
+    assert b"".join(replies) == b"".join(heartbeats)
+    sample = 1 / 16_000
+    check_clock(firmware, 0.0123456 - sample)
+    check_clock(firmware, 0.05 - sample)

@@ -39,13 +39,15 @@ AT = (0.08, 0.06)
 
 def phases(bench: Bench, times: tuple[float, ...], *frequencies: float) -> np.ndarray:
     """Phases [rad] (t, f) of tones at the finger, mean of the half second before each time [s]."""
-    found = []
+    angles = []
     for time in times:
         keep_alive(bench, time)
         (record,) = bench.sample_fingers().felt(time - 0.5, time).values()
         samples = record.accelerations[:, 0]
-        found.append([np.angle(lock_in(record.times, samples, each)) for each in frequencies])
-    return np.array(found)
+        angles.append(
+            [np.angle(lock_in(record.times, samples, frequency)) for frequency in frequencies]
+        )
+    return np.array(angles)
 
 
 def test_angle_is_the_frequency_word_times_the_clock(two_amplifiers: Rig) -> None:
@@ -68,9 +70,9 @@ def test_tone_goes_on_where_the_clock_goes_round(coarse_rig: Rig) -> None:
     bench = Bench(coarse_rig, now=18.0)
     bench.place_fingers({"a": AT}, now=18.0)
     play_at_once(bench, AmplifierTone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
-    before, over, after = phases(bench, (19.9, 20.4, 40.3), 110.05)
-    assert before == pytest.approx(over, abs=1e-5)
-    assert before == pytest.approx(after, abs=1e-5)
+    early, over, late = phases(bench, (19.9, 20.4, 40.3), 110.05)
+    assert early == pytest.approx(over, abs=1e-5)
+    assert early == pytest.approx(late, abs=1e-5)
 
 
 def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
@@ -82,9 +84,9 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
         play_at_once(
             bench, AmplifierTone(0, frequency, 0.5), now=0.0, name=name, watchdog=2.0, ramp=0.02
         )
-    found = phases(bench, (3.0, 5.0), 110.0, 170.0)
-    left, right = (found[1] - found[0]) / (2 * math.pi * np.array([110.0, 170.0]))
-    assert (left, right) == pytest.approx((80e-6, -60e-6), abs=0.5e-6)
+    angles = phases(bench, (3.0, 5.0), 110.0, 170.0)
+    left_delay, right_delay = (angles[1] - angles[0]) / (2 * math.pi * np.array([110.0, 170.0]))
+    assert (left_delay, right_delay) == pytest.approx((80e-6, -60e-6), abs=0.5e-6)
     for step in range(200):  # 70 ppm slower, it is as slow as the other
         bench.exchange(
             "left",
@@ -92,7 +94,7 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
             {"session": BENCH_SESSION, "rate": -700},
             now=5.05 + step / 20,
         )
-    steered = phases(bench, (15.5,), 110.0)[0, 0] - found[1, 0]
+    steered = phases(bench, (15.5,), 110.0)[0, 0] - angles[1, 0]
     # From 4.75 s to 5.05 s as before, and to 15.25 s so.
     expected = 0.3 * 40e-6 - 10.2 * 30e-6
     assert steered / (2 * math.pi * 110) == pytest.approx(expected, abs=1e-6)
@@ -100,15 +102,17 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
 
 def test_shift_is_of_the_phase(coarse_rig: Rig) -> None:
     """Arm with 5 steps of 20 s / 65536 lets a tone of 110 Hz lead by 60.4 degrees."""
-    found = []
+    delays = []
     for shift in (0, 5):
         bench = Bench(coarse_rig, now=0.0)
         bench.place_fingers({"a": AT}, now=0.0)
         values = {"session": BENCH_SESSION, "watchdog": 2000, "shift": shift}
         bench.exchange("main", "Arm", values, now=0.0)
         play_at_once(bench, AmplifierTone(0, 110.0, 0.5), now=0.1)
-        found.append(phases(bench, (3.0,), 110.0)[0, 0])
-    assert math.degrees(found[1] - found[0]) == pytest.approx(360 * 110 * 5 * 20 / 65536, abs=1e-3)
+        delays.append(phases(bench, (3.0,), 110.0)[0, 0])
+    assert math.degrees(delays[1] - delays[0]) == pytest.approx(
+        360 * 110 * 5 * 20 / 65536, abs=1e-3
+    )
 
 
 START = 98765.4321  # as large as a clock may be
@@ -256,8 +260,12 @@ def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
 
 def test_finger_that_is_solved_late_is_felt_as_one_that_is_solved_at_once(rig: Rig) -> None:
     """The plate waits for it, so that samples before and after it are the same."""
-    late = driven(rig, lambda one: one.begin_placing({"a": PLACE_A, "b": PLACE_B}, now=one.time))
-    at_once = driven(rig, lambda one: one.place_fingers({"a": PLACE_A, "b": PLACE_B}, now=one.time))
+    late = driven(
+        rig, lambda bench: bench.begin_placing({"a": PLACE_A, "b": PLACE_B}, now=bench.time)
+    )
+    at_once = driven(
+        rig, lambda bench: bench.place_fingers({"a": PLACE_A, "b": PLACE_B}, now=bench.time)
+    )
     for since, until in ((0.1, 0.5), (0.51, 1.2)):
         ours, theirs = (bench.records(since, until)[0] for bench in (late, at_once))
         assert ours.keys() == theirs.keys()

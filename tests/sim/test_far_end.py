@@ -41,7 +41,9 @@ def test_usb_moves_bytes_in_the_next_frame() -> None:
     times = [number * 1.3717e-3 for number in range(2000)]
     for shift in (delays.leave, delays.arrive):
         moved = [shift(time, 10) for time in times]
-        late = [after - before for after, before in zip(moved, times, strict=True)]
+        late = [
+            moved_at - requested_at for moved_at, requested_at in zip(moved, times, strict=True)
+        ]
         assert min(late) >= 0
         assert max(late) <= 1e-3 * (1 + FRAME_ERROR)
         assert statistics.mean(late) == pytest.approx(0.5e-3, rel=0.05)

@@ -9,17 +9,15 @@ import stat
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from cases import read_yaml, shortly
+from cases import shortly
 from drivers.errors import LinkError
 from drivers.playing import AmplifierTone
 from drivers.protocol.definition import QUANTITIES, STATES
-from kit.courses import Taken
 from kit.plates import write_rig
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
@@ -65,32 +63,61 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
         assert not link.is_symlink()
 
 
-@dataclass(kw_only=True)
-class Asked(Taken):
-    """A simulation as a process that is asked by its control socket; reply: the last one."""
-
-    far_end: FarEndProcess
-    reply: dict[str, Any] = field(default_factory=dict)
-
-    async def asks(self, op: str, **values: Any) -> None:
-        """Ask for an operation."""
-        self.reply = await self.far_end.ask(op, **values)
-
-
 async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path) -> None:
-    """Watchdog and faults follow the steps."""
+    """The watchdog of 0.5 s and faults follow the steps of the control socket."""
     rig = write_rig(tmp_path / "rig.yaml")
-    courses = read_yaml(Path(__file__).with_name("simulation.yaml"))
+    tone = AmplifierTone(0, 110.0, 0.5)
     async with far_end_process(rig, "--serial", "--virtual-time", "--finger", "0.1,0.1") as far_end:
-        asked = Asked(far_end=far_end)
-        await asked.repeats(1, courses["before it plays"])
-        tone = AmplifierTone(0, 110.0, 0.5)
+        greeting = await far_end.ask("hello")
+        assert greeting["protocol"] == "era-sim-control"
+        assert greeting["version"] == 3
+        assert greeting["clock"] == "virtual"
+        assert greeting["urls"] == far_end.urls
+        assert (await far_end.ask("state"))["time_s"] == 0
         async with playing(far_end.urls["main"], tone, watchdog=0.5) as amplifier:
-            await asked.repeats(1, courses["while it plays"])
+            assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
+            assert (await amplifier_state(far_end))["levels"][0] == 0.5
+            assert await far_end.ask("step", seconds=0.09) == {"ok": True, "time_s": 0.49}
+            assert (await amplifier_state(far_end))["fault"] == "NONE"
+            await far_end.ask("step", seconds=0.51)
+            assert (await amplifier_state(far_end))["fault"] == "WATCHDOG"
+
             await amplifier.read_status()
             await amplifier.clear()
             await amplifier.arm(DAEMONS_SESSION + 1, 0.5)
-            await asked.repeats(1, courses["once it is armed again"])
+            await far_end.ask("inject_fault", fault="arc", amplifier="main")
+            assert (await amplifier_state(far_end))["fault"] == "ARC"
+            fault = {"fault": "arc", "begin_s": 1.0, "end_s": None, "is_on": True}
+            assert (await far_end.ask("faults"))["faults"] == {"main": [fault]}
+            await far_end.ask("recover")
+            assert (await far_end.ask("faults"))["faults"] == {"main": []}
+        assert (await far_end.end())[0] == 0
+
+
+async def amplifier_state(far_end: FarEndProcess) -> dict[str, Any]:
+    """Return the state of the amplifier main."""
+    state = await far_end.ask("state")
+    return dict(state["amplifiers"]["main"])
+
+
+async def test_simulation_moves_fingers_and_rejects_invalid_operations(tmp_path: Path) -> None:
+    """Errors name the finger, the amplifier or the value."""
+    rig = write_rig(tmp_path / "rig.yaml")
+    async with far_end_process(rig, "--serial", "--virtual-time", "--finger", "0.1,0.1") as far_end:
+        await far_end.ask("move", finger="1", at_m=[0.05, 0.05])
+        await far_end.ask("touch", finger="2", at_m=[0.2, 0.2])
+        assert "2" in (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["error"]
+        assert (await far_end.ask("state"))["fingers"] == {"1": [0.05, 0.05], "2": [0.2, 0.2]}
+        await far_end.ask("lift", finger="1")
+        assert "1" in (await far_end.ask("move", finger="1"))["error"]
+        assert (await far_end.ask("state"))["fingers"] == {"2": [0.2, 0.2]}
+
+        unknown = await far_end.ask("inject_fault", fault="arc", amplifier="x")
+        assert "amplifier" in unknown["error"]
+        impossible = await far_end.ask("inject_fault", fault="drop", share=2)
+        assert "share" in impossible["error"]
+        backward = await far_end.ask("step", seconds=-1)
+        assert "seconds" in backward["error"]
         assert (await far_end.end())[0] == 0
 
 
@@ -252,10 +279,10 @@ async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_pat
         assert str(LINE_MAX) in json.loads(await endless.readline())["error"]
         writer.write(b'{"op": "state"}\n')
         assert "amplifiers" in json.loads(await reader.readline())
-        for each in (writer, deaf):
-            each.close()
+        for connection in (writer, deaf):
+            connection.close()
             with contextlib.suppress(ConnectionError):
-                await each.wait_closed()
+                await connection.wait_closed()
     assert mode(socket_path) is None
 
 

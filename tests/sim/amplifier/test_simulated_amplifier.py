@@ -14,11 +14,9 @@ import re
 import socket
 import struct
 import tty
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import can
@@ -26,17 +24,14 @@ import pytest
 
 from drivers.errors import LinkError
 from drivers.protocol.definition import FAULTS, REFUSALS, STATES
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
-from kit.courses import Step, Taken, courses, fits, follow
-from kit.plates import make_paper_rig
-from kit.wires import MASTERS, drive, far_side, make_bench, on_amplifiers, until
+from kit.wires import MASTERS, drive, far_side, make_bench, until
 from model.rig.rig import Rig
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.bench.bench import Bench
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -104,143 +99,181 @@ def test_moment_of_a_high_word(rate: int) -> None:
     assert 1637 * 20 / 65536 * 0.996 < moment - now < 1638 * 20 / 65536 * 1.004
 
 
-ARM = {"session": 7, "watchdog": 250, "shift": 0}
+SESSION = 7
 
 
-def armed() -> SimulatedAmplifier:
-    """An amplifier armed by session 7 at time 0, watchdog 0.25 s."""
-    amplifier = SimulatedAmplifier("a", channels=2)
-    amplifier.handle("Arm", ARM, 0.0)
-    return amplifier
+class Requests:
+    """An amplifier of two channels, the requests that it handles and the events that it sends."""
+
+    def __init__(self, *, is_armed: bool = True) -> None:
+        self.amplifier = SimulatedAmplifier("a", channels=2)
+        self.events: list[tuple[str, int]] = []
+        """The state and latch of each event once it is armed."""
+        self.event_times: list[float] = []
+        """When each event was sent [s]."""
+        if is_armed:
+            self.arm(0.0)
+        self.amplifier.listeners.append(self._note)
+
+    def _note(self, event: Values, time: float) -> None:
+        self.events.append((state_name(event), event["latch"]))
+        self.event_times.append(time)
+
+    def ask(self, time: float, name: str, **values: Any) -> Values:
+        """Return the reply to a request at a time [s]."""
+        return self.amplifier.handle(name, values, time)
+
+    def arm(self, time: float, session: int = SESSION, watchdog: int = 250, shift: int = 0) -> str:
+        """Arm; return the state."""
+        reply = self.ask(time, "Arm", session=session, watchdog=watchdog, shift=shift)
+        return state_name(reply)
+
+    def ping(self, time: float, rate: int = 0) -> Values:
+        """Feed the watchdog and set the rate of the clock."""
+        return self.ask(time, "Ping", session=SESSION, rate=rate)
+
+    def status(self, time: float) -> Values:
+        """Return the status."""
+        return self.ask(time, "GetStatus")
+
+    def play(
+        self, time: float, token: int, *tones: tuple[int, int], layer: int = 0, now: bool = True
+    ) -> Values:
+        """Send a set of one layer with channels and levels [1e-4] of tones of 100 Hz."""
+        commands = tuple(Command(channel, 2000, level, 0) for channel, level in tones)
+        words = pack_layers((LayerSet(layer, 0, 0, commands),))
+        (part,) = parts(words, session=SESSION, token=token, now=now)
+        return self.amplifier.handle("Set", part, time)
 
 
-def tone(channel: int = 0, frequency: int = 2000, level: int = 5000, **other: object) -> Command:
-    """A tone of 100 Hz at half level unless told otherwise."""
-    return Command(channel, frequency, level, 0, **other)  # type: ignore[arg-type]
+def state_name(values: Values) -> str:
+    """Return the name of the state in a status or an event."""
+    return next(name for name, code in STATES.items() if code == values["state"])
 
 
-def part_of(token: int, *layers: LayerSet, now: bool = True) -> Values:
-    """The only part of a set of session 7."""
-    (part,) = parts(pack_layers(layers), session=7, token=token, now=now)
-    return part
+def lead(status: Values, time: float) -> int:
+    """Return the lead of a clock over one without errors [2^-32 of 20 s]."""
+    return int(status["clock"]) - round(time * PER_SECOND)
 
 
-def levels(amplifier: SimulatedAmplifier, at: float) -> list[int]:
-    """Levels of the status at a time, in 1e-4."""
-    return list(amplifier.handle("GetStatus", {}, at)["levels"])
+def test_heat_derates_and_then_trips() -> None:
+    """Above 70 degrees C half of every level, reported as inexact; above 85 a fault until cool."""
+    requests = Requests()
+    requests.play(0.0, 1, (0, 5000))
+    requests.amplifier.set_temperature(71.0, 0.1)
+    assert requests.status(0.13)["levels"] == [2500, 0]
+    assert requests.play(0.13, 2, (1, 8000), layer=1)["exact"] == 0
+    assert requests.status(0.14)["levels"] == [2500, 4000]
+
+    requests.amplifier.set_temperature(86.0, 0.2)
+    assert requests.status(0.21)["fault"] == FAULTS["OVER_TEMPERATURE"]
+    assert state_name(requests.ask(0.22, "Clear", latch=1)) == "FAULT"
+    requests.amplifier.set_temperature(60.0, 0.3)
+    assert state_name(requests.ask(0.31, "Clear", latch=1)) == "SWITCH_ON_DISABLED"
 
 
-@dataclass(kw_only=True)
-class Handled(Taken):
-    """An amplifier that handles requests; reply: the last one, at a time [s].
+def test_open_interlock_trips_and_prevents_arming() -> None:
+    """It is neither cleared nor armed until the interlock is closed."""
+    requests = Requests()
+    requests.amplifier.set_interlock(moment=0.1, is_open=True)
+    requests.amplifier.tick(0.2)
+    assert requests.events == [("FAULT_REACTION_ACTIVE", 1), ("FAULT", 1)]
+    assert state_name(requests.ask(0.2, "Clear", latch=1)) == "FAULT"
 
-    handle: of the name of an amplifier, for several; events: the name of the state, the latch and
-    the time of each.
+    requests.amplifier.set_interlock(moment=0.3, is_open=False)
+    requests.ask(0.3, "Clear", latch=1)
+    assert requests.arm(0.3, session=8) == "OPERATION_ENABLED"
+
+
+def test_restart_forgets_all_but_the_faults() -> None:
+    """Silent and disarmed, without token and latch; an arc on channel 1 was 0.2 s ago."""
+    requests = Requests()
+    requests.play(0.0, 9, (0, 5000))
+    requests.amplifier.trip(fault="ARC", moment=0.1, channel=1)
+
+    requests.amplifier.restart(0.2)
+
+    status = requests.status(0.2)
+    assert state_name(status) == "SWITCH_ON_DISABLED"
+    assert (status["token"], status["latch"]) == (0, 0)
+    assert status["levels"] == [0, 0]
+    faults = requests.ask(0.3, "GetFaults")["faults"]
+    assert faults == [{"fault": FAULTS["ARC"], "channel": 1, "age": 200}]
+
+
+def test_high_voltage_is_on_while_armed_and_then_discharges() -> None:
+    """1800 V: 1273 V rms at full level, and 2 pi f/2 C U = 400 uA in a capacitor of 1 nF.
+
+    20 ms after disarming 1800/e V are left. An amplifier that was never armed has none.
     """
+    requests = Requests()
+    requests.play(0.0, 1, (0, 10000))
+    first_channel = requests.ask(0.01, "GetMeasured")["channels"][0]
+    assert first_channel["channel_voltage"] == pytest.approx(12727.9, abs=1)
+    assert first_channel["channel_current"] == pytest.approx(399.9, abs=1)
 
-    amplifier: SimulatedAmplifier
-    handle: Callable[[str, str, Values, float], Values]
-    reply: Values = field(default_factory=dict)
-    at: float = 0.0
-    events: list[tuple[str, int, float]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        """Note all events."""
-        self.amplifier.listeners.append(
-            lambda event, at: self.events.append((_named("state", event), event["latch"], at))
-        )
-
-    @property
-    def ahead(self) -> int:
-        """By how much the clock of the last reply is ahead of one without errors [2^-32 turns]."""
-        return int(self.reply["clock"]) - round(self.at * PER_SECOND)
-
-    def asks(self, name: str, at: float, of: str = "", **values: Any) -> None:
-        """Handle a request at a time."""
-        self.at, self.reply = at, self.handle(of, name, values, at)
-
-    def plays(
-        self, token: int, at: float, tone: Sequence[int], layer: int = 0, valid_for: int = 0
-    ) -> None:
-        """Handle a set that plays a tone at once: channel, frequency and level."""
-        one = LayerSet(layer, 0, valid_for, (Command(*tone, 0),))
-        self.reply = self.handle("", "Set", part_of(token, one), at)
-
-    def renews(self, token: int, at: float, valid_for: int) -> None:
-        """Handle a set that renews the first layer."""
-        self.handle("", "Set", part_of(token, LayerSet(0, 0, valid_for, renew=True)), at)
-
-    async def is_refused(self, code: str, step: Step) -> None:
-        """Require that a step is refused with a code."""
-        with pytest.raises(Refusal) as caught:
-            await self.take(step)
-        assert caught.value.code == code
-
-    def replies(self, **expected: Any) -> None:
-        """Require values of the last reply, states and faults by name."""
-        found = {what: _named(what, self.reply) for what in expected}
-        assert fits(found, expected), found
+    requests.ask(0.1, "Disarm", ramp=0)
+    assert requests.status(0.12)["high_voltage"] == 662
+    assert Requests(is_armed=False).ask(0.0, "Stop", ramp=5)["high_voltage"] == 0
 
 
-def _named(what: str, values: Values) -> Any:
-    """A value, a state or fault by its name."""
-    names = {"state": STATES, "fault": FAULTS}.get(what, {})
-    return next((name for name, code in names.items() if code == values[what]), values[what])
+def test_ping_sets_the_rate_of_an_armed_session() -> None:
+    """100 ppm for a second are 21 475 steps of the clock; a disarmed amplifier has no rate."""
+    requests = Requests(is_armed=False)
+    requests.ping(0.0, rate=1000)
+    requests.arm(1.0, watchdog=2000)
+
+    assert lead(requests.ping(1.0, rate=1000), 1.0) == pytest.approx(0, abs=1)
+    assert lead(requests.ping(2.0, rate=1000), 2.0) == pytest.approx(21475, abs=1)
+    requests.ask(2.0, "Disarm", ramp=0)
+    assert lead(requests.status(4.0), 4.0) == pytest.approx(21475, abs=1)
 
 
-@asynccontextmanager
-async def handled(*names: str, is_armed: bool = True) -> AsyncIterator[Handled]:
-    """An amplifier of two channels, armed by session 7 at time 0 with a watchdog of 0.25 s.
+def test_expired_watchdog_ends_the_rate() -> None:
+    """It counts real time: 3276.7 ppm for 0.25 s are 175 916.5 steps."""
+    requests = Requests()
+    requests.ping(0.0, rate=32767)
 
-    names: those of amplifiers at the paper's plate instead.
-    """
-    if not names:
-        one = armed() if is_armed else SimulatedAmplifier("a", channels=2)
-        yield Handled(amplifier=one, handle=lambda _, *request: one.handle(*request))
-        return
-    bench = Bench(on_amplifiers(make_paper_rig(12, 9), names), now=0.0)
-    yield Handled(
-        amplifier=bench.amplifiers[names[0]],
-        handle=lambda of, name, values, at: bench.exchange(of or names[0], name, values, now=at),
-    )
+    requests.amplifier.tick(1.0)
+
+    assert requests.event_times[0] == pytest.approx(0.25)
+    assert lead(requests.status(1.0), 1.0) == pytest.approx(175916.5, abs=1)
 
 
-COURSES = courses(Path(__file__).with_name("courses.yaml"))
+def test_arm_shifts_the_clock_of_a_new_session_once() -> None:
+    """By 3 steps of the high word, 65536 each; a restarted clock shows 0."""
+    requests = Requests(is_armed=False)
+    requests.arm(0.0, shift=3)
+    requests.arm(0.1, shift=3)
+    assert lead(requests.status(0.1), 0.1) == 3 * 65536
 
+    requests.amplifier.restart(5.0)
 
-@pytest.mark.parametrize("name", COURSES)
-def test_amplifier_keeps_to_its_course(name: str) -> None:
-    """Every step is as it is in the file."""
-    follow(COURSES[name], handled)
+    assert requests.status(5.0)["clock"] == 0
 
 
 def test_temperature_follows_the_mean_square_level() -> None:
     """Half level on both channels: a quarter of 30 K, 1 - 1/e of it after 120 s."""
-    amplifier = SimulatedAmplifier("a", channels=2)
-    amplifier.handle("Arm", {"session": 7, "watchdog": 2000, "shift": 0}, 0.0)
-    amplifier.handle("Set", part_of(1, LayerSet(0, 0, 0, (tone(0), tone(1)))), 0.0)
+    requests = Requests(is_armed=False)
+    requests.arm(0.0, watchdog=2000)
+    requests.play(0.0, 1, (0, 5000), (1, 5000))
     for second in range(1, 121):
-        status = amplifier.handle("Ping", {"session": 7, "rate": 0}, float(second))
+        status = requests.ping(float(second))
     assert status["temperature"] == pytest.approx(250 + 75 * (1 - 1 / math.e), abs=1)
 
 
-def play_from(
-    amplifier: SimulatedAmplifier, token: int, level: int, at: float, moment: int
-) -> None:
-    """Stage a set of channel 0 at a time [s], and commit it for a high word of the clock."""
-    one = LayerSet(0, 0, 0, (tone(level=level),))
-    amplifier.handle("Set", part_of(token, one, now=False), at)
-    amplifier.handle("Commit", {"session": 7, "token": token, "at": moment % 65536}, at)
-
-
 @pytest.mark.parametrize(
-    ("moment", "waits"), [(99, False), (100, False), (101, True), (1738, True), (1739, False)]
+    ("moment", "level"), [(99, 5000), (100, 5000), (101, 0), (1738, 0), (1739, 5000)]
 )
-def test_moments_beyond_half_a_second_are_now(moment: int, waits: bool) -> None:
-    """The present high word, one that has passed, or one more than 1638 steps ahead: at once."""
-    amplifier, at = armed(), 100.5 * 20 / 65536
-    play_from(amplifier, 1, 5000, at, moment)
-    assert (levels(amplifier, at) == [0, 0]) is waits
+def test_commit_for_no_moment_ahead_starts_immediately(moment: int, level: int) -> None:
+    """The present high word, 100, one that has passed, or one more than 1638 steps ahead."""
+    requests = Requests()
+    now = 100.5 * 20 / 65536
+    requests.play(now, 1, (0, 5000), now=False)
+
+    requests.ask(now, "Commit", session=SESSION, token=1, at=moment)
+
+    assert requests.status(now)["levels"] == [level, 0]
 
 
 @pytest.mark.parametrize("name", MASTERS)
@@ -276,26 +309,27 @@ async def client(end: TcpEnd) -> AsyncIterator[Client]:
             await writer.wait_closed()
 
 
-async def ask(one: Client, request: bytes, size: int) -> bytes:
+async def ask(connection: Client, request: bytes, size: int) -> bytes:
     """What a client receives for bytes that it sends."""
-    one[1].write(request)
-    return await asyncio.wait_for(one[0].readexactly(size), TIMEOUT)
+    reader, writer = connection
+    writer.write(request)
+    return await asyncio.wait_for(reader.readexactly(size), TIMEOUT)
 
 
 async def test_connections_share_the_registers_of_a_unit(coarse_rig: Rig) -> None:
     """What one client has written, tag 7 to Stop, the other reads: another unit says nothing."""
-    async with tcp_end(coarse_rig) as end, client(end) as one, client(end) as other:
+    async with tcp_end(coarse_rig) as end, client(end) as writing, client(end) as reading:
         write = struct.pack(">HHHBBHHBHH", 2, 0, 11, 1, 16, 256 * 8, 2, 4, 7, 0)
-        assert (await ask(one, write, 12))[6:] == write[6:12]
+        assert (await ask(writing, write, 12))[6:] == write[6:12]
         look = struct.pack(">HHHBBHH", 3, 0, 6, 1, 3, 256 * 8 + 128, 3)
         elsewhere = struct.pack(">HHHBBHH", 4, 0, 6, 9, 3, 256 * 8 + 128, 3)
-        reply = await ask(other, elsewhere + look, 15)
+        reply = await ask(reading, elsewhere + look, 15)
         assert struct.unpack(">HHHBBBHHH", reply) == (3, 0, 9, 1, 3, 6, 7, 0, 5)
 
 
 async def test_client_that_does_not_read_is_disconnected(coarse_rig: Rig) -> None:
     """Its replies fill no memory, and others are served."""
-    async with tcp_end(coarse_rig) as end, client(end) as other:
+    async with tcp_end(coarse_rig) as end, client(end) as well_behaved:
         loop = asyncio.get_running_loop()
         with socket.socket() as deaf:
             deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
@@ -309,7 +343,7 @@ async def test_client_that_does_not_read_is_disconnected(coarse_rig: Rig) -> Non
 
             with pytest.raises(OSError, match=r"reset|pipe"):
                 await asyncio.wait_for(ask_on(), TIMEOUT)
-        assert len(await ask(other, IDENTITY, IDENTITY_SIZE)) == IDENTITY_SIZE
+        assert len(await ask(well_behaved, IDENTITY, IDENTITY_SIZE)) == IDENTITY_SIZE
         assert len(end.connections) == 1
 
 
@@ -414,25 +448,43 @@ SET = (  # session 1234, token 7: layer 0 along 0 ms, channel 0 at 100 Hz and ha
 COMMIT = ("200 0000060334120700", "200 0001000000000000")
 
 
+class CanNode:
+    """An amplifier of one channel on CAN, armed by session 1234."""
+
+    def __init__(self) -> None:
+        self.amplifier = SimulatedAmplifier("a", channels=1)
+        self.replies: list[bytes] = []
+        self.end = CanAmplifiers({1: self.amplifier}, self.replies.append)
+        self.end.start(0.0)
+        self.send(0.0, "000 0100", "201 010003033412fa00", "201 0101000000000000")
+        self.replies.clear()
+
+    def send(self, time: float, *frames: str) -> None:
+        """Send frames, each an identifier and data in hexadecimal digits."""
+        packed = []
+        for frame in frames:
+            identifier, data = frame.split()
+            packed.append(CanFrame(int(identifier, 16), bytes.fromhex(data)))
+        self.end.receive(pack_frames(packed), time)
+
+    def level(self, time: float) -> float:
+        """Return the level that it plays."""
+        self.end.tick(time)
+        return self.amplifier.playback.level(0, time)
+
+
 @pytest.mark.parametrize("lost", range(4))
 def test_set_without_one_of_its_frames_is_not_played(lost: int) -> None:
-    """No reply, nothing to commit; the repetition under a newer number is."""
-    far, sent = SimulatedAmplifier("a", channels=1), list[bytes]()
-    end = CanAmplifiers({1: far}, sent.append)
+    """No reply, and nothing to commit; the repetition under a newer number plays."""
+    node = CanNode()
+    node.send(0.1, *SET[:lost], *SET[lost + 1 :], *COMMIT)
+    assert node.replies == []
+    assert node.level(0.1) == 0.0
 
-    def put(now: float, *frames: str) -> tuple[list[bytes], float]:
-        """Send frames; returns what comes back at once, and what it plays then."""
-        sent.clear()
-        pairs = ((int(each[:3], 16), bytes.fromhex(each[4:])) for each in frames)
-        end.receive(pack_frames(CanFrame(*pair) for pair in pairs), now)
-        back = [*sent]
-        end.tick(now)
-        return back, far.playback.level(0, now)
+    repeated = [frame.replace("201 02", "201 03", 1) for frame in SET]
+    node.send(0.11, *repeated, *COMMIT)
 
-    end.start(0.0)
-    put(0.0, "000 0100", "201 010003033412fa00", "201 0101000000000000")  # starts it, and arms it
-    assert put(0.1, *SET[:lost], *SET[lost + 1 :], *COMMIT) == ([], 0.0)
-    assert put(0.11, *(f"201 03{each[6:]}" for each in SET), *COMMIT)[1] == 0.5
+    assert node.level(0.11) == 0.5
 
 
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))

@@ -100,7 +100,7 @@ def test_imperfections_delay_lags_in_phase(two_amplifiers: Rig) -> None:
     early_amplitude = settled_amplitude(two_amplifiers, early, "right", 0)
     late_amplitude = settled_amplitude(two_amplifiers, late, "right", 0)
 
-    lag = np.degrees(np.angle(early_amplitude / late_amplitude))
+    lag = np.angle(early_amplitude / late_amplitude, deg=True)
     assert lag == pytest.approx(39.6, abs=1e-4)
 
 
@@ -155,7 +155,9 @@ def drawn_parameters(imperfections: Imperfections, rig: Rig) -> dict[str, float]
     }
     for era in rig.eras:
         parameters[f"stiffness {era.name}"] = plate.stiffness[era.name]
-        parameters[f"x {era.name}"], parameters[f"y {era.name}"] = plate.places[era.name]
+        x, y = plate.places[era.name]
+        parameters[f"x {era.name}"] = x
+        parameters[f"y {era.name}"] = y
     for channel, errors in imperfections.channels.items():
         parameters[f"real {channel}"] = errors.harmonic.real
         parameters[f"imaginary {channel}"] = errors.harmonic.imag
@@ -200,12 +202,13 @@ def test_drawn_imperfections_have_the_spread_of_the_rig(coarse_rig: Rig) -> None
     for seed in range(500):
         plates.append(drawn_parameters(draw_imperfections(rig, seed=seed), rig))
 
-    samples = np.array([list(plate.values()) for plate in plates])
-    for name, values in zip(plates[0], samples.T, strict=True):
-        mean, spread = SPREADS.get(name) or SPREADS[name.split()[0]]
+    samples = np.array([list(plate.values()) for plate in plates]).T
+    for name, values in zip(plates[0], samples, strict=True):
+        kind = name if name in SPREADS else name.split()[0]
+        mean, spread = SPREADS[kind]
         assert values.mean() == pytest.approx(mean, abs=0.15 * spread), name
         assert values.std() == pytest.approx(spread, rel=0.1), name
-    correlations = np.corrcoef(samples.T)
+    correlations = np.corrcoef(samples)
     assert_allclose(correlations, np.eye(len(correlations)), atol=0.2)
 
 
@@ -249,7 +252,8 @@ def test_imperfect_plate_vibrates_as_a_rig_that_was_built_so(coarse_rig: Rig) ->
 
     assert_allclose(imperfect, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
     _, nominal = record(coarse_rig, PERFECT, drive, duration=1.0)
-    assert np.abs(imperfect - nominal).max() > 0.1 * np.abs(nominal).max()
+    change = np.abs(imperfect - nominal).max()
+    assert change > 0.1 * np.abs(nominal).max()
 
 
 @pytest.mark.parametrize("errors", [{"gain": -0.1}, {"phase": math.nan}])
@@ -312,9 +316,11 @@ def test_base_moves_as_the_sum_of_its_voices(seed: int, delay: float) -> None:
             now += chance.uniform(0.0005, 0.004)
             expected = 0.0
             for voice in voices:
-                rotation = cmath.exp(2j * math.pi * voice.frequency * now)
+                omega = 2 * math.pi * voice.frequency
+                rotation = cmath.exp(1j * omega * now)
                 expected += STROKE * (voice.transition.at(now) * rotation).imag
-            position = positions_of(motion, np.array([now + delay]))[0]
+            times = np.array([now + delay])
+            (position,) = positions_of(motion, times)
             assert position == pytest.approx(expected, abs=1e-16)
 
 
@@ -322,10 +328,12 @@ def test_measured_vibration_separates_the_driven_frequencies() -> None:
     """Two tones and a transient at neither: the amplitude of each tone, and the peak of all."""
     times = 51234.5 + np.arange(3000) / 10_000
     amplitudes = np.array([[2.0, 0.5], [0.3, 0.0]])
-    tones = np.outer(np.sin(2 * np.pi * 110 * times + 1.0), amplitudes[0])
-    tones += np.outer(np.cos(2 * np.pi * 170 * times - 2.0), amplitudes[1])
+    angle = 2 * np.pi * times
+    first_tone = np.sin(110 * angle + 1.0)
+    second_tone = np.cos(170 * angle - 2.0)
+    tones = np.outer(first_tone, amplitudes[0]) + np.outer(second_tone, amplitudes[1])
     decay = np.exp(-(times - times[0]) / 0.02)
-    transient = 0.4 * decay * np.sin(2 * np.pi * 163.3 * times)
+    transient = 0.4 * decay * np.sin(163.3 * angle)
     samples = tones + transient[:, None]
     points = np.zeros((2, 2))
     weights = np.full(2, 0.5)
@@ -344,9 +352,8 @@ def test_fingers_stay_where_they_are_when_one_is_off_the_plate(
     coarse_rig: Rig, position: tuple[float, float]
 ) -> None:
     """The error names the finger; more than 32 fingers are rejected as well."""
-    rigid = ReducedPlate(
-        coarse_rig.plate, np.zeros(1), np.zeros(1), lambda points: np.ones((len(points), 1))
-    )
+    zero = np.zeros(1)
+    rigid = ReducedPlate(coarse_rig.plate, zero, zero, lambda points: np.ones((len(points), 1)))
     fingers = PlateFingers(rigid)
     fingers.place({"a": (0.1, 0.1)})
 

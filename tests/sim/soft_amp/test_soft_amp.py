@@ -60,9 +60,9 @@ def test_devices_are_listed_with_outputs_inputs_rate_and_block() -> None:
     name = f"list{os.getpid()}"
     with jack_server(name, rate=RATE, inputs=3, outputs=4) as server:
         capture = Capture(name, "card", CHANNELS)
-        found = _listed(server.environment)["devices"]
+        devices = _listed(server.environment)["devices"]
         capture.close()
-    by_name = {device["name"]: device for device in found}
+    by_name = {device["name"]: device for device in devices}
     common = {"host": "JACK Audio Connection Kit", "rate_hz": RATE, "block_frames": None}
     ports = {"system": (4, 3), "card": (CHANNELS, 0)}
     for device, (outputs, inputs) in ports.items():
@@ -141,13 +141,13 @@ def play(results: Connection) -> None:
         return float((words[7] << 16 | words[8]) / 2**32 * TURN - since / CLOCK_RATE)
 
     run(1)  # the host is there
-    shown = [clock()]
+    readings = [clock()]
     caller.latency = 384 / CLOCK_RATE
-    shown.append(clock())
+    readings.append(clock())
     caller.frame += 480
-    shown.append(clock())
+    readings.append(clock())
     library().sound_release()
-    results.send(shown)
+    results.send(readings)
 
 
 @pytest.mark.needs("cc")
@@ -163,12 +163,12 @@ def test_clock_is_that_at_the_output() -> None:
     process.start()
     try:
         assert results.poll(60)
-        first, *others = results.recv()
+        first, *later_results = results.recv()
     finally:
         process.kill()
         process.join()
-    for other in others:
-        assert (first - other) % TURN == pytest.approx(384 / CLOCK_RATE, abs=TOLERANCE)
+    for reading in later_results:
+        assert (first - reading) % TURN == pytest.approx(384 / CLOCK_RATE, abs=TOLERANCE)
 
 
 def settings(**changed: object) -> SoftAmplifierSettings:
@@ -201,12 +201,16 @@ def test_settings_out_of_range_are_refused(changed: dict[str, object], key: str)
 
 def test_more_than_16_channels_are_two_amplifiers() -> None:
     """At addresses 1 and 2 of a serial line, units 1 and 2 of Modbus."""
-    given = settings(channels=18, law=Law.SQUARE, limit=0.9)
-    assert SoftAmplifierLine("serial:///x").urls(given.amplifiers, protocol=Protocol.SERIAL) == [
+    square_law = settings(channels=18, law=Law.SQUARE, limit=0.9)
+    assert SoftAmplifierLine("serial:///x").urls(
+        square_law.amplifiers, protocol=Protocol.SERIAL
+    ) == [
         "serial:///x",
         "serial:///x?address=2",
     ]
-    urls = SoftAmplifierLine("modbus+tcp://h:1").urls(given.amplifiers, protocol=Protocol.MODBUS)
+    urls = SoftAmplifierLine("modbus+tcp://h:1").urls(
+        square_law.amplifiers, protocol=Protocol.MODBUS
+    )
     assert urls == ["modbus+tcp://h:1/1", "modbus+tcp://h:1/2"]
 
 
@@ -246,7 +250,7 @@ def test_block_is_shorter_than_a_reply_may_take(
 
 
 @pytest.mark.parametrize(
-    ("device", "known", "problem", "cause"),
+    ("device", "names", "problem", "cause"),
     [
         ("Scarlet 4i4", [], LinkError, "connect a sound card"),
         ("Scarlet 4i4", ["Scarlett 4i4"], InputError, "did you mean Scarlett 4i4"),
@@ -256,7 +260,7 @@ def test_block_is_shorter_than_a_reply_may_take(
 )
 def test_unknown_device_is_rejected_with_a_remedy(
     device: str,
-    known: list[str],
+    names: list[str],
     problem: type[Exception],
     cause: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -265,7 +269,7 @@ def test_unknown_device_is_rejected_with_a_remedy(
 
     def query(number: object = None, _kind: object = None) -> object:
         if number is None:
-            return [{"name": name} for name in known]
+            return [{"name": name} for name in names]
         raise ValueError(f"No output device matching {number!r}")
 
     library = SimpleNamespace(query_devices=query, PortAudioError=OSError)
@@ -382,10 +386,10 @@ def test_samples_arrive_at_jack_as_commanded(tmp_path: Path) -> None:
         assert f"{RATE} Hz, blocks of {CARD_BLOCK} frames" in amp.log
         with host(amp.url, CARD_CHANNELS) as playing:
             wait_for(lambda: capture.has_sounded_for(2.3))  # 0.2 s of soft start and ramp
-            found = amplitudes(capture.samples(2 * RATE), RATE)
-            sizes = np.median(np.abs(found), axis=0)
-            steps = np.median(np.angle(found[:, 1:] / found[:, :-1]), axis=0)
-            turns = np.median(np.angle(found[1:] / found[:-1]), axis=0)
+            amplitude_of = amplitudes(capture.samples(2 * RATE), RATE)
+            sizes = np.median(np.abs(amplitude_of), axis=0)
+            steps = np.median(np.angle(amplitude_of[:, 1:] / amplitude_of[:, :-1]), axis=0)
+            turns = np.median(np.angle(amplitude_of[1:] / amplitude_of[:-1]), axis=0)
             np.testing.assert_allclose(20 * np.log10(sizes / 0.5), 0, atol=0.1)
             np.testing.assert_allclose(np.degrees(steps), 30, atol=0.1)
             np.testing.assert_allclose(np.degrees(turns), 0, atol=0.1)
@@ -466,13 +470,13 @@ def test_systemd_is_told_of_sound_and_not_of_a_stall(server: str, tmp_path: Path
 @pytest.mark.usefixtures("unhurried")
 async def test_silence_is_an_open_output_of_zeros(server: str, tmp_path: Path) -> None:
     """After a lost host, a stop and a disarm: connected, and every sample exactly zero."""
-    here = Capture(server, "zeros", 2)
+    capture = Capture(server, "zeros", 2)
     soft_amp = amplifier_on("zeros, JACK", 2, server, tmp_path)
     lines = Lines()
 
     async def silent(end: Callable[[Amplifier], Awaitable[object]] | None) -> None:
         with host(soft_amp.url, 2) as playing:
-            wait_for(here.is_sounding)
+            wait_for(capture.is_sounding)
             playing.kill()
             playing.wait()
         if end is not None:
@@ -480,18 +484,18 @@ async def test_silence_is_an_open_output_of_zeros(server: str, tmp_path: Path) -
             await amplifier.open()
             await end(amplifier)
             await lines.close()
-        wait_for(lambda: not here.is_sounding())
-        begin = here.position
-        _wait_for_samples(here, 0.5)
-        assert not here.samples(here.position - begin).any()
-        assert all(here.is_played_to(f"zeros:in_{n}") for n in (1, 2))
+        wait_for(lambda: not capture.is_sounding())
+        begin = capture.position
+        _wait_for_samples(capture, 0.5)
+        assert not capture.samples(capture.position - begin).any()
+        assert all(capture.is_played_to(f"zeros:in_{n}") for n in (1, 2))
 
     await silent(None)
     await silent(lambda amplifier: amplifier.stop())
     await silent(lambda amplifier: amplifier.disarm())
     soft_amp.end()
     assert soft_amp.process.returncode == 0
-    here.close()
+    capture.close()
 
 
 @pytest.mark.real_time
@@ -521,10 +525,10 @@ def test_lost_server_ends_the_amplifier(tmp_path: Path) -> None:
     with jack_server(name) as running:
         Capture(name, "looking", 1).close()  # once the server is up
         amp = amplifier_on("system, JACK", 2, name, tmp_path)
-        before = amp.log
+        earlier_log = amp.log
         running.process.terminate()
         assert amp.process.wait(60) == 3
-        message = amp.log.removeprefix(before)
+        message = amp.log.removeprefix(earlier_log)
         assert (message.count("\n"), "device was lost" in message) == (1, True)
     amp.end()
 

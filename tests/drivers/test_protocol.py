@@ -57,15 +57,15 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
     await group.beat()
     status = await end.hosts["a"].read_status()
     assert end.levels("a") == [0.5, 0.0]
-    assert {each: status[each] for each in status if each not in _FIRST} == STATED[age]
+    assert {name: status[name] for name in status if name not in _FIRST} == STATED[age]
     assert status_rows(status | {"clock": 0x40000000})["clock_s"] == 5.0  # a quarter of 20 s
-    shown = {"older": None, "same": 0.0, "newer": "no key"}[age]
-    assert status_rows(status).get("later_voltage_v", "no key") == shown
+    temperature = {"older": None, "same": 0.0, "newer": "no key"}[age]
+    assert status_rows(status).get("later_voltage_v", "no key") == temperature
     assert (await group.stop())["a"].is_confirmed
 
 
 _FIRST = frozenset(STATUS_RECORD.names)
-_UNSTATED = [0] * sum(each.words for each in STATUS_RECORD.added)
+_UNSTATED = [0] * sum(entry.words for entry in STATUS_RECORD.added)
 """What the table has added, of an amplifier that states only what is later than the table."""
 _OLDER = 11 + 4 + 8 + len(_UNSTATED)
 """Words of 4 channels and 8 layers."""
@@ -75,7 +75,7 @@ _OLDER = 11 + 4 + 8 + len(_UNSTATED)
 def test_conformance_takes_another_edition(kind: str, age: str) -> None:
     """Words behind those that are known, or fewer, break no rule."""
     checks = "capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths"
-    assert {each.result for each in judged(kind, checks)} == {"passed"}
+    assert {result.result for result in judged(kind, checks)} == {"passed"}
 
 
 def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
@@ -183,7 +183,7 @@ def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert writer.dropped == 15
     may_go_on.set()
     writer.close()
-    text = "".join(each.args[0] for each in file.write.call_args_list)
+    text = "".join(call.args[0] for call in file.write.call_args_list)
     assert text.count("later") == 10
     assert text.endswith("trace: 15 records dropped\n")
 
@@ -295,10 +295,14 @@ def test_stream_that_no_host_may_send_is_refused(
 def test_set_is_whole_whatever_the_order_of_its_parts() -> None:
     """The parts but the last, in both orders and one again, give the stream that was cut."""
     stream = list(range(300))
-    *others, last = parts(stream, session=9, token=7, now=False)
-    assert [len(MESSAGES["Set"].request.pack(part)) for part in (*others, last)] == [120, 120, 69]
-    assert [is_last(part) for part in (*others, last)] == [False, False, True]
-    for order in permutations(others):
+    *first_parts, last = parts(stream, session=9, token=7, now=False)
+    assert [len(MESSAGES["Set"].request.pack(part)) for part in (*first_parts, last)] == [
+        120,
+        120,
+        69,
+    ]
+    assert [is_last(part) for part in (*first_parts, last)] == [False, False, True]
+    for order in permutations(first_parts):
         assembly = Assembly()
         assert [assembly.keep(part, 0.1) for part in (*order, order[0])] == [True] * 3
         assert assembly.first_missing(last) is None
@@ -349,7 +353,7 @@ STATUS: Values = {
     },
     **{"levels": [2000, 0, 0, 10000], "tokens": [513, 0]},
 }
-NOT_STATED = dict.fromkeys(each.name for each in STATUS_RECORD.added)
+NOT_STATED = dict.fromkeys(entry.name for entry in STATUS_RECORD.added)
 """What later editions add."""
 STATUS_WORDS = [
     *(4, 0, 1, 0, 250, 0xFFCB, 1800, 1, 2, 513, 0x0402),
@@ -441,10 +445,10 @@ def test_random_words_are_read_or_refused() -> None:
         ]
         for record in (message.request, message.reply):
             try:
-                found = record.unpack(values, is_strict=True)
+                unpacked = record.unpack(values, is_strict=True)
             except Refusal:
                 continue
             read += 1
-            packed = record.pack(found)
+            packed = record.pack(unpacked)
             assert [*packed, *[0] * (len(values) - len(packed))] == values
     assert read > 300

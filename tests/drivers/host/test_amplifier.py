@@ -37,13 +37,15 @@ from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
     """Of a request that came twice, and late: each of its replies is of its own moment."""
     line, far = SerialWire(921_600, sequence=1), SimulatedAmplifier("a", channels=2)
-    (asked,) = FrameReader().feed(line.request(1, "GetStatus", {}))
+    (question,) = FrameReader().feed(line.request(1, "GetStatus", {}))
     arrivals = []
     for temperature in (250, 251):
         words = MESSAGES["GetStatus"].reply.pack({**far.status(0.0), "temperature": temperature})
-        arrivals += line.received(encode_frame(asked._replace(kind=asked.kind | REPLY_BIT), words))
+        arrivals += line.received(
+            encode_frame(question._replace(kind=question.kind | REPLY_BIT), words)
+        )
         line.request(1, "Hello", {})
-    assert [type(each) for each in arrivals] == [Reply]
+    assert [type(arrival) for arrival in arrivals] == [Reply]
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"tcp"}))
@@ -52,7 +54,7 @@ async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
     """Both reply to Hello, with their serial numbers; it names the remedy."""
     line = MemoryLine(kind, "a", "b")
     ends = line.far_end, line.kind.far_end({2: SimulatedAmplifier("c", channels=2)}, line.send)
-    line.far_end = Mock(receive=lambda data, now: [each.receive(data, now) for each in ends])
+    line.far_end = Mock(receive=lambda data, now: [end.receive(data, now) for end in ends])
     with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
         await line.hosts["b"].open()
     await line.hosts["a"].open()
@@ -77,7 +79,7 @@ OTHER = {
 
 def shown(*commands: Command) -> Values:
     """The reply to GetAchieved of a layer with these tones."""
-    return {**asdict(SENT), "commands": [asdict(each) for each in commands]}
+    return {**asdict(SENT), "commands": [asdict(command) for command in commands]}
 
 
 @pytest.mark.parametrize("played", SAME)
@@ -118,8 +120,8 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
         ],
     }
     handle = far.handle
-    far.handle = lambda name, given, now, **options: (  # type: ignore[method-assign]
-        values if name == "GetMeasured" else handle(name, given, now, **options)
+    far.handle = lambda name, sent, now, **options: (  # type: ignore[method-assign]
+        values if name == "GetMeasured" else handle(name, sent, now, **options)
     )
     await host.open()
     assert await read_electrical(host) == [(1234.5, 250e-6), (0.0, 0.0)]
@@ -185,9 +187,9 @@ async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
     ]
     await asyncio.sleep(0.1)
     await lines.close()
-    for each in opening:
+    for request in opening:
         with pytest.raises(LinkError, match="closed"):
-            await each
+            await request
     assert port.close.call_count == port.open.await_count
 
 
@@ -224,7 +226,7 @@ async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
             str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))
             for number in far.amplifiers
         }
-        assert len({each.line for each in amplifiers.values()}) == 1
+        assert len({amplifier.line for amplifier in amplifiers.values()}) == 1
         group = Group(amplifiers)
         await group.open()
         await group.arm()
@@ -234,7 +236,7 @@ async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
         assert levels == pytest.approx([0.5, 0.5], abs=1e-9)
         await group.beat()
         stopped = await group.stop()
-        assert all(each.is_confirmed for each in stopped.values())
+        assert all(outcome.is_confirmed for outcome in stopped.values())
         assert [far.level(number) for number in far.amplifiers] == [0.0, 0.0]
         nobody = await lines.amplifier(far.url(3), LIMITS, name="3")
         with pytest.raises(LinkTimeout):
@@ -251,14 +253,14 @@ async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs() -> None:
     """
     async with (
         WORD_WIRES["can+python-can virtual"](1) as behind_adapter,
-        WORD_WIRES["serial"](1) as other,
+        WORD_WIRES["serial"](1) as serial,
         opened_lines() as lines,
     ):
         with hanging_interface() as adapter:
             url = behind_adapter.url(1).replace("virtual", "hanging")
             amplifiers = {
                 "adapter": await lines.amplifier(url, LIMITS, name="adapter"),
-                "other": await lines.amplifier(other.url(1), LIMITS, name="other"),
+                "other": await lines.amplifier(serial.url(1), LIMITS, name="other"),
             }
             group = Group(amplifiers)
             await group.open()
@@ -268,7 +270,7 @@ async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs() -> None:
             await until(lambda: behind_adapter.level(1) == pytest.approx(0.5))
             adapter.hangs = True
             stopping = asyncio.create_task(group.stop())
-            await until(lambda: other.level(1) == 0.0)
+            await until(lambda: serial.level(1) == 0.0)
             await amplifiers["other"].read_status()
             assert adapter.sending == 1
             adapter.resume()
@@ -289,18 +291,18 @@ async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs() -> None:
 async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
     """Requests of both amplifiers fail with the same message, and those of a new line do not."""
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
-        both = [
+        amplifiers = [
             await lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers
         ]
-        for amplifier in both:
+        for amplifier in amplifiers:
             await amplifier.open()
         far.unplug()
         messages = set()
-        for amplifier in both:
+        for amplifier in amplifiers:
             with pytest.raises(LinkError) as lost:
                 await read_for_ever(amplifier)
             messages.add(str(lost.value))
-        assert messages == {both[0].line.loss}
+        assert messages == {amplifiers[0].line.loss}
         assert "was lost" in messages.pop()
         if wire in SERVED:  # whose server listens on
             again = await asyncio.gather(
@@ -308,7 +310,7 @@ async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
             )
             for amplifier in again:
                 await amplifier.open()
-            assert len({each.line for each in (*again, both[0])}) == 2
+            assert len({amplifier.line for amplifier in (*again, amplifiers[0])}) == 2
         else:
             with pytest.raises(LinkError, match=r"cannot be opened|refused"):
                 await lines.amplifier(far.url(1), LIMITS, name="a")

@@ -87,11 +87,11 @@ def messages_on_serial(sent: bytes) -> Iterator[Message]:
     """Decode frames of a serial line: COBS between zeros, CRC-32, words with the low byte first."""
     for stuffed in filter(None, sent.split(b"\0")):
         body = bytearray()
-        rest = stuffed
-        while rest:
-            block_end = rest[0]
-            body += rest[1:block_end] + b"\0"
-            rest = rest[block_end:]
+        remainder = stuffed
+        while remainder:
+            block_end = remainder[0]
+            body += remainder[1:block_end] + b"\0"
+            remainder = remainder[block_end:]
         body.pop()  # the last block has no zero behind it
         payload = body[5:-4]  # type, version, address and sequence before it, the CRC behind it
         assert zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little")
@@ -112,11 +112,11 @@ def messages_on_rtu(sent: bytes) -> Iterator[Message]:
     """Decode Modbus RTU: unit, PDU and CRC-16."""
 
     def pdus() -> Iterator[bytes]:
-        rest = sent
-        while rest:
-            size = 9 + rest[6] if rest[1] == 16 else 8
-            yield rest[1 : size - 2]
-            rest = rest[size:]
+        remainder = sent
+        while remainder:
+            size = 9 + remainder[6] if remainder[1] == 16 else 8
+            yield remainder[1 : size - 2]
+            remainder = remainder[size:]
 
     return messages_on_modbus(pdus())
 
@@ -125,11 +125,11 @@ def messages_on_tcp(sent: bytes) -> Iterator[Message]:
     """Decode Modbus TCP: transaction, 0, length, unit and PDU."""
 
     def pdus() -> Iterator[bytes]:
-        rest = sent
-        while rest:
-            size = 6 + int.from_bytes(rest[4:6], "big")
-            yield rest[7:size]
-            rest = rest[size:]
+        remainder = sent
+        while remainder:
+            size = 6 + int.from_bytes(remainder[4:6], "big")
+            yield remainder[7:size]
+            remainder = remainder[size:]
 
     return messages_on_modbus(pdus())
 
@@ -241,11 +241,11 @@ def differences(expected: Tones, actual: Tones) -> list[str]:
     return texts
 
 
-def assert_same_tones(expected: Tones, actual: Tones, what: str) -> None:
+def assert_same_tones(expected: Tones, actual: Tones, context: str) -> None:
     """Fail with one line for each quantity of a channel that differs."""
     texts = differences(expected, actual)
     if texts:
-        raise AssertionError(f"{what}: {'; '.join(texts)}")
+        raise AssertionError(f"{context}: {'; '.join(texts)}")
 
 
 def layers_of(case: Case) -> list[AmplifierLayer]:

@@ -88,16 +88,16 @@ def test_reader_searches_endless_noise_in_bounded_time_and_memory(
     data = (noise * (1 << 16))[: 1 << 16]
     frame = WHOLE if waits else RESPONSE
 
-    found: list[Adu] = []
+    frames: list[Adu] = []
     for start in range(0, len(data), part):
         check.reset_mock()
-        found += reader.feed(data[start : start + part])
+        frames += reader.feed(data[start : start + part])
         assert len(reader.rest) <= 256
         assert check.call_count <= 1024
-    found += reader.end() + reader.feed(frame)
+    frames += reader.end() + reader.feed(frame)
 
-    assert b"".join(adu.raw for adu in found) == data + frame
-    assert [adu.raw for adu in found if adu.pdu] == [frame]
+    assert b"".join(adu.raw for adu in frames) == data + frame
+    assert [adu.raw for adu in frames if adu.pdu] == [frame]
 
 
 @pytest.mark.parametrize(
@@ -250,15 +250,15 @@ def test_request_reads_as_many_registers_as_its_reply_can_have() -> None:
     status = HEAD + STATUS.words + sum(record.words for record in STATUS.added)
     capabilities = HEAD + MESSAGES["GetCaps"].reply.words + 3 * 16
     achieved = HEAD + MESSAGES["GetAchieved"].reply.words
-    most = {
+    limits = {
         "GetStatus": status + 16 + 16,
         "GetAchieved": achieved + 4 * 16,
         "GetCaps": capabilities,
         "GetFaults": 122,
     }
-    identified = {**most, "GetStatus": status + 4 + 8, "GetAchieved": achieved + 4 * 4}
+    identified = {**limits, "GetStatus": status + 4 + 8, "GetAchieved": achieved + 4 * 4}
 
-    for counts in (most, identified):
+    for counts in (limits, identified):
         for name, count in counts.items():
             read = write(wire, far_end, name, {"layer": 0} if name == "GetAchieved" else {})
             assert read[4:6] == count.to_bytes(2), name

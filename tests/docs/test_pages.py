@@ -15,6 +15,7 @@ from importlib import import_module
 from importlib.metadata import requires
 from pathlib import Path
 
+import numpy as np
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -46,38 +47,42 @@ from registry.limits import GuardLimits
 ROOT = Path(__file__).parents[2]
 
 
-def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
+FOLDERS_WITH_GENERATED_FILES = (
+    ".",
+    "docs/reference",
+    "docs/how-to",
+    "controller/api",
+    "firmware/core",
+    "examples/javascript",
+)
+
+
+def test_every_file_marked_as_generated_has_a_generator() -> None:
     """A mark, or the name of a generator in the first lines of a file."""
-    claimed = re.compile(
+    mark = re.compile(
         r"<!-- begin: written by|\A.*\n?.*\n?.*(?:made|[Ww]ritten) by docs/generators"
     )
-    found = {
-        path.relative_to(pages.ROOT).as_posix()
-        for folder in (
-            *(".", "docs/reference", "docs/how-to", "controller/api", "firmware/core"),
-            "examples/javascript",
-        )
-        for path in (pages.ROOT / folder).glob("*.*")
-        if path.suffix in (".md", ".py", ".pyi", ".h", ".ts")
-        and claimed.search(path.read_text("utf-8"))
-    }
-    assert len(found) > 6
-    assert found <= set(pages.WRITTEN)
+    marked = set()
+    for folder in FOLDERS_WITH_GENERATED_FILES:
+        for path in (ROOT / folder).glob("*.*"):
+            is_text = path.suffix in (".md", ".py", ".pyi", ".h", ".ts")
+            if is_text and mark.search(path.read_text("utf-8")):
+                marked.add(path.relative_to(ROOT).as_posix())
+
+    assert len(marked) > 6
+    assert marked - set(pages.WRITTEN) == set()
 
 
 def test_constraints_pin_every_dependency_within_its_bounds() -> None:
-    """One tested version of each that the extras for users require, directly or not."""
-    lines = [
-        line
-        for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()
-        if not line.startswith("#")
-    ]
-    pinned = dict(line.split("==") for line in lines)
+    """One tested version of each direct or indirect dependency of the extras for users."""
+    lines = (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+    pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
+
     assert constraints.closure("era-haptics", *constraints.EXTRAS).keys() == pinned.keys()
     for text in requires("era-haptics") or ():
-        required = Requirement(text)
-        if required.marker is None or required.marker.evaluate({"extra": "gateway"}):
-            assert pinned[canonicalize_name(required.name)] in required.specifier
+        requirement = Requirement(text)
+        if requirement.marker is None or requirement.marker.evaluate({"extra": "gateway"}):
+            assert pinned[canonicalize_name(requirement.name)] in requirement.specifier, text
 
 
 PAGES = ROOT / "docs" / "tutorials"
@@ -85,8 +90,8 @@ PAGES = ROOT / "docs" / "tutorials"
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
-def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path) -> None:
-    """A tutorial typed from an empty folder beside the examples prints what it shows."""
+def test_tutorial_prints_the_output_that_it_shows(page: str, tmp_path: Path) -> None:
+    """Each command is typed from an empty folder next to the examples."""
     folder = tmp_path / "my_plate"
     folder.mkdir()
     (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -101,11 +106,12 @@ def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path) -> None:
             reader.follow(step)
 
 
-def test_the_first_tutorial_writes_the_rig_of_the_others() -> None:
-    """Who skipped it copies the same file from the examples."""
-    written = [step for step in read_steps(PAGES / "own-plate.md") if step.kind == "written"]
-    example = (ROOT / "examples" / "tutorial_rig.yaml").read_text("utf-8")
-    assert [(step.name, step.text) for step in written] == [("my_rig.yaml", example)]
+def test_first_tutorial_writes_the_rig_of_the_others() -> None:
+    """A reader who skips it copies the same file from the examples."""
+    steps = read_steps(PAGES / "own-plate.md")
+    files = {step.name: step.text for step in steps if step.kind == "written"}
+
+    assert files == {"my_rig.yaml": text_of("examples/tutorial_rig.yaml")}
 
 
 def rows(page: str, head: str) -> list[list[str]]:
@@ -115,11 +121,12 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line[1:-1].split("|")] for line in table.splitlines()[2:]]
 
 
-def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
+def test_page_has_the_word_that_people_see_for_each_state() -> None:
     """In the status, in the event of a change, and in a line unless the cause begins with it."""
-    shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown as |")}
-    assert list(shown) == [state.value for state in DaemonState]
-    for state, word in shown.items():
+    words = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown as |")}
+
+    assert list(words) == [state.value for state in DaemonState]
+    for state, word in words.items():
         event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None, epoch=1)
         assert event.model_dump()["word"] == word
         assert headline(state, event.cause) == f"{word}: a cable was cut"
@@ -127,12 +134,14 @@ def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
 
 
 def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
-    """As the configuration's model has them, and no others; a section's keys in its row."""
-    told = {row[0].strip("`"): row[1] for row in rows("daemon.md", "| key | meaning | default |")}
-    assert sorted(told) == sorted(DaemonSection.model_fields)
+    """The keys of the configuration's model, and no others; a section's keys in its row."""
+    table = rows("daemon.md", "| key | meaning | default |")
+    meanings = {row[0].strip("`"): row[1] for row in table}
+
+    assert sorted(meanings) == sorted(DaemonSection.model_fields)
     for key, section in {"touch": TouchSection, "log": LogSection}.items():
-        (listed,) = re.findall(r"`\{(.*?)\}`", told[key])[:1]
-        assert listed.split(", ") == list(section.model_fields)
+        (keys,) = re.findall(r"`\{(.*?)\}`", meanings[key])[:1]
+        assert keys.split(", ") == list(section.model_fields)
 
 
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
@@ -150,36 +159,45 @@ def commands(group: TyperGroup, name: str = "era") -> Iterator[tuple[str, TyperC
             yield full, command
 
 
+def option_names(command: TyperCommand) -> set[str]:
+    """The long names of a command's visible options."""
+    visible = [option for option in command.params if not getattr(option, "hidden", False)]
+    names = {max(option.opts, key=len) for option in visible}
+    return {name for name in names if name.startswith("--")} - {"--help"}
+
+
 def test_page_lists_every_command_with_its_options() -> None:
-    """The names on the page are those of the program; what it says once, it says above them."""
+    """Options of many commands are described once, above the commands that refer to them."""
     parts = re.split(r"^### ", PAGE, flags=re.MULTILINE)[1:]
-    listed = {part.splitlines()[0]: part for part in parts}
-    known = dict(commands(join_commands(command_modules())[0]))
+    sections = {part.splitlines()[0]: part for part in parts}
+    program = dict(commands(join_commands(command_modules())[0]))
     common = set(re.findall(r"^- `(--[a-z-]+)", parts[0], re.MULTILINE))
-    assert {name for name in listed if name.startswith("era ")} == set(known)
-    for name, command in known.items():
-        own = re.findall(r"^- `(?:-\w, )?(--[a-z-]+)", listed[name], re.MULTILINE)
-        also = re.findall(
-            r"`(--[a-z-]+)", listed[name].lower().partition("also with ")[2].split("\n")[0]
-        )
-        assert set(also) <= common, name
-        named = {*own, *also}
-        shown = [each for each in command.params if not getattr(each, "hidden", False)]
-        names = {max(option.opts, key=len) for option in shown}
-        assert named == {name for name in names if name.startswith("--")} - {"--help"}, name
+
+    assert {name for name in sections if name.startswith("era ")} == set(program)
+    for name, command in program.items():
+        section = sections[name]
+        described = re.findall(r"^- `(?:-\w, )?(--[a-z-]+)", section, re.MULTILINE)
+        reference = section.lower().partition("also with ")[2].split("\n")[0]
+        referenced = re.findall(r"`(--[a-z-]+)", reference)
+        assert set(referenced) - common == set(), name
+        assert {*described, *referenced} == option_names(command), name
 
 
-def test_every_command_with_json_tells_its_keys() -> None:
-    """A command that has the option is in the table of keys."""
+def test_every_command_with_json_has_its_keys_in_the_table() -> None:
+    """A command that has the option `--json` is in the table of keys."""
     table = PAGE.partition("## What `--json` prints")[2].partition("## All commands")[0]
-    listed = " ".join(re.findall(r"^\| (`era .*?) \|", table, re.MULTILINE))
-    parts = re.split(r"^### era ", PAGE, flags=re.MULTILINE)[1:]
+    first_cells = " ".join(re.findall(r"^\| (`era .*?) \|", table, re.MULTILINE))
+    sections = re.split(r"^### era ", PAGE, flags=re.MULTILINE)[1:]
     with_json = [
-        part.splitlines()[0] for part in parts if re.search(r"[Aa]lso with .*`--json`", part)
+        section.splitlines()[0]
+        for section in sections
+        if re.search(r"[Aa]lso with .*`--json`", section)
     ]
+
     assert len(with_json) > 30
     for name in with_json:
-        assert f"`era {name}`" in listed or f"`{name.split()[-1]}`" in listed, name
+        is_listed = f"`era {name}`" in first_cells or f"`{name.split()[-1]}`" in first_cells
+        assert is_listed, name
 
 
 @pytest.fixture(scope="module")
@@ -210,21 +228,24 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )
-def test_the_keys_are_those_that_are_printed(
+def test_page_lists_the_keys_that_a_command_prints(
     arguments: list[str], built: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The table names the keys at the top of what `--json` prints, and no others."""
     monkeypatch.chdir(built)
     monkeypatch.setattr(overview, "CONTACT_SETS", 12)
-    commands = config_commands if arguments[0] == "config" else app
-    result = CliRunner().invoke(commands, [*arguments, "--json"])
-    assert result.exit_code == 0, result.output
+    program = config_commands if arguments[0] == "config" else app
     name = " ".join(["era", *arguments[:2]])
+
+    result = CliRunner().invoke(program, [*arguments, "--json"])
+
+    assert result.exit_code == 0, result.output
     (row,) = re.findall(rf"^\| .*`{name}`.* \| (.*) \|$", PAGE, re.MULTILINE)
-    row = re.sub(r"\(.*?\)", "", row)
-    keys = set(re.findall(r"`(\w+)`", row))
-    for key in [key for key in keys if "_N_" in key]:
-        keys = keys - {key} | {key.replace("N", number) for number in "123"}
+    listed = re.findall(r"`(\w+)`", re.sub(r"\(.*?\)", "", row))
+    keys = set()
+    for key in listed:
+        numbers = "123" if "_N_" in key else "1"
+        keys |= {key.replace("_N_", f"_{number}_") for number in numbers}
     assert keys == set(json.loads(result.stdout))
 
 
@@ -233,15 +254,15 @@ def test_readme_shows_what_the_demonstration_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its scale, the rows of three people and the summary, which virtual time makes repeatable."""
-    readme = text_of("README.md")
-    ((command, shown),) = re.findall(
-        r"^    \$ \.venv/bin/era (demo .*)\n((?:    .*\n)+)", readme, re.MULTILINE
-    )
-    assert shown.count("of 3 vibrations") == 3
+    session = re.compile(r"^    \$ \.venv/bin/era (demo .*)\n((?:    .*\n)+)", re.MULTILINE)
+    ((command, output),) = session.findall(text_of("README.md"))
+    assert output.count("of 3 vibrations") == 3
     monkeypatch.chdir(ROOT)
+
     assert run_era([*command.split(), "--out", str(tmp_path)]) == 0
-    what = difference(textwrap.dedent(shown), capsys.readouterr().out)
-    assert what is None, what
+
+    first_difference = difference(textwrap.dedent(output), capsys.readouterr().out)
+    assert first_difference is None, first_difference
 
 
 FIRST_COMMANDS = re.findall(r"`\.venv/bin/era ([^`]+)`", (ROOT / "README.md").read_text("utf-8"))
@@ -279,42 +300,40 @@ STATED_CONSTANT = re.compile(r"(\d+) (dB|%|ms|s)<!-- ([\w.]+)\.([A-Z_]+) -->")
 
 def test_pages_state_the_constants_of_the_code() -> None:
     """A number that is followed by the name of a constant has its value."""
-    stated = [
-        (page.name, name, float(number) * UNITS[unit], getattr(import_module(module), name))
-        for page in FACT_PAGES
-        for number, unit, module, name in STATED_CONSTANT.findall(page.read_text("utf-8"))
-    ]
-    assert len(stated) > 10
-    wrong = [row for row in stated if row[2] != pytest.approx(row[3])]
-    assert wrong == []
+    statements, values = {}, {}
+    for page in FACT_PAGES:
+        for number, unit, module, name in STATED_CONSTANT.findall(page.read_text("utf-8")):
+            statements[page.name, name] = float(number) * UNITS[unit]
+            values[page.name, name] = getattr(import_module(module), name)
+
+    assert len(statements) > 10
+    assert statements == pytest.approx(values)
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/concepts/localization.md"])
 def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
     """The share and number of fingers of the main run; clicks are counted by runs of their own."""
     figures, _, _ = text_of("docs/measured/promise.md").partition("<!-- end figures -->")
-    rows = re.findall(r"(\d+) % of (\d+) \|", figures)
-    counts = [int(count) for _, count in rows]
-    kept = sum(int(share) * int(count) for share, count in rows) / sum(counts)
+    cells = re.findall(r"(\d+) % of (\d+) \|", figures)
+    shares, counts = np.array(cells, dtype=int).T
     ((share, count),) = re.findall(r"(\d+) % of\s+(\d+) fingers", text_of(page))
-    assert int(count) == sum(counts)
-    assert float(share) == pytest.approx(kept, abs=1)
+
+    assert int(count) == counts.sum()
+    assert float(share) == pytest.approx(np.average(shares, weights=counts), abs=1)
 
 
-def test_files_that_pages_name_are_there() -> None:
+def test_files_that_pages_name_exist() -> None:
     """Every file named on a page exists; tests are named without their folder."""
     tests = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
     folders = "|".join(path.name for path in ROOT.iterdir() if path.is_dir())
-    named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
-    gone = {
-        name
-        for page in FACT_PAGES
-        for name in named.findall(page.read_text("utf-8"))
-        if not (ROOT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
-    }
-    pages = [page.read_text("utf-8") for page in FACT_PAGES]
-    assert gone == set()
-    assert {name for page in pages for name in re.findall(r"`(test_\w+\.py)`", page)} <= tests
+    file_name = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
+
+    for page in FACT_PAGES:
+        text = page.read_text("utf-8")
+        names = [name for name in file_name.findall(text) if not name.startswith("dist/")]
+        missing = [name for name in names if not (ROOT / name).exists()]
+        assert set(missing) <= {"tests/faults/AREA.yaml"}, page
+        assert set(re.findall(r"`(test_\w+\.py)`", text)) - tests == set(), page
 
 
 URLS_PAGE = (ROOT / "docs" / "reference" / "urls.md").read_text("utf-8")
@@ -322,92 +341,100 @@ EXAMPLES = re.findall(r"^\| `(\S+)` \| `(\S+)` \| (\d+) \|$", URLS_PAGE, re.MULT
 
 
 @pytest.mark.parametrize(("url", "line", "number"), EXAMPLES)
-def test_example_is_the_amplifier_that_the_page_says(url: str, line: str, number: str) -> None:
-    """Its line, and its number there."""
+def test_example_url_is_the_amplifier_that_the_page_states(
+    url: str, line: str, number: str
+) -> None:
+    """Its line, and its number on the line."""
     address = address_of(url)
     assert (address.line, address.number) == (line, int(number))
 
 
 def test_slowest_line_is_that_of_the_page() -> None:
-    """As the check has it; the next slower speed is refused."""
-    baud, bitrate = map(int, re.findall(r"at least (\d+) baud, or (\d+) kbit/s", URLS_PAGE)[0])
-    slow = {
-        "a": "serial:///dev/a?baud={}",
-        "b": "modbus+rtu:///dev/b?baud={}",
-        "c": "can+slcan:///c?bitrate={}",
-    }
-    for factor, refused in ((1, []), (2, [*slow])):
-        speeds = {"a": baud // factor, "b": baud // factor, "c": bitrate * 1000 // factor}
-        urls = {name: url.format(speeds[name]) for name, url in slow.items()}
+    """The check accepts it and rejects half of that speed."""
+    ((baud, kilobits),) = re.findall(r"at least (\d+) baud, or (\d+) kbit/s", URLS_PAGE)
+
+    def rejected_at(share: float) -> list[str]:
+        bauds, bitrate = int(share * int(baud)), int(share * 1000 * int(kilobits))
+        urls = {
+            "a": f"serial:///dev/a?baud={bauds}",
+            "b": f"modbus+rtu:///dev/b?baud={bauds}",
+            "c": f"can+slcan:///c?bitrate={bitrate}",
+        }
         errors, _ = check_links(urls, channels={}, limits=GuardLimits(40.0, 250.0, 1.0))
-        assert [*errors] == refused
+        return [*errors]
+
+    assert rejected_at(1) == []
+    assert rejected_at(0.5) == ["a", "b", "c"]
 
 
 def test_page_has_every_scheme_and_the_time_of_a_board() -> None:
-    """Those that an unknown one is answered with, in the first table and the help."""
-    with pytest.raises(CommandError) as unknown:
+    """The schemes that the error for an unknown scheme lists, in the first table and the help."""
+    with pytest.raises(CommandError) as error:
         address_of("carrier+pigeon://roof")
-    named = set(re.findall(r"([\w+-]+)://[,;\s]", f"{unknown.value} ")) - {"carrier+pigeon"}
-    on_page = set(re.findall(r"^\| `([\w+-]+)://", URLS_PAGE, re.MULTILINE))
-    assert on_page == named, "run make pages"
-    in_help = set(re.findall(r"^  ([\w+-]+)://", str(amp.info.epilog), re.MULTILINE))
-    assert in_help == named, "run make pages"
+    schemes = set(re.findall(r"([\w+-]+)://[,;\s]", f"{error.value} ")) - {"carrier+pigeon"}
+    schemes_on_page = set(re.findall(r"^\| `([\w+-]+)://", URLS_PAGE, re.MULTILINE))
+    schemes_in_help = set(re.findall(r"^  ([\w+-]+)://", str(amp.info.epilog), re.MULTILINE))
+
+    assert schemes_on_page == schemes, "run make pages"
+    assert schemes_in_help == schemes, "run make pages"
     assert f"for {BOOT_TIME:g} s" in URLS_PAGE
 
 
 def test_every_page_can_be_found() -> None:
-    """Each page stands in the side bar, or its folder's index, which stands there, links to it."""
+    """Each page is in the side bar, or a page of figures or pictures there links to it."""
     docs = ROOT / "docs"
-    index = (docs / "index.md").read_text("utf-8")
-    listed = set(re.findall(r"^(?:.* <)?([a-z-]+(?:/[\w-]+)?)>?$", index, re.MULTILINE))
+    entry = re.compile(r"^(?:.* <)?([a-z-]+(?:/[\w-]+)?)>?$", re.MULTILINE)
+    linked = set(entry.findall(text_of("docs/index.md")))
     for name in ("measured/figures", "gallery"):
-        assert name in listed
-        folder, links = Path(name).parent, (docs / f"{name}.md").read_text("utf-8")
-        listed |= {str(folder / page) for page in re.findall(r"\(([\w/-]+)\.md\)", links)}
-    pages = {path.relative_to(docs) for path in docs.rglob("*.md")}
-    names = {page.with_suffix("").as_posix() for page in pages if page.parts[0] != "_build"}
-    assert names - listed == {"index"}
+        assert name in linked
+        folder = Path(name).parent
+        links = re.findall(r"\(([\w/-]+)\.md\)", text_of(f"docs/{name}.md"))
+        linked |= {str(folder / link) for link in links}
+    page_names = set()
+    for path in docs.rglob("*.md"):
+        page = path.relative_to(docs)
+        if page.parts[0] != "_build":
+            page_names.add(page.with_suffix("").as_posix())
+
+    assert page_names - linked == {"index"}
 
 
-def test_the_version_is_the_same_wherever_it_is_stated() -> None:
+def test_version_is_the_same_wherever_it_is_stated() -> None:
     """The newest release of the changelog, the citation and the packages have one version."""
-    stated = {
+    patterns = {
         "pyproject.toml": r'^version = "(.+)"',
         "CITATION.cff": r"^version: (.+)",
         "CHANGELOG.md": r"^## \[(.+)\] - \d{4}-\d\d-\d\d$",
         "examples/javascript/package.json": r'^  "version": "(.+)"',
     }
-    texts = {name: (ROOT / name).read_text("utf-8") for name in stated}
-    versions = {name: re.findall(stated[name], texts[name], re.MULTILINE)[0] for name in stated}
+    versions = {}
+    for name, pattern in patterns.items():
+        match = re.search(pattern, text_of(name), re.MULTILINE)
+        assert match, name
+        versions[name] = match[1]
+
     assert len(set(versions.values())) == 1, versions
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])
-def test_links_beside_the_docs_lead_somewhere(name: str) -> None:
-    """What a link to a file of the project names is there."""
-    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", (ROOT / name).read_text("utf-8"))
+def test_links_of_top_level_pages_exist(name: str) -> None:
+    """A link to a file of the project names an existing file."""
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", text_of(name))
+
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_pages_that_are_named_in_code_are_there() -> None:
+def test_pages_that_are_named_in_code_exist() -> None:
     """Messages, docstrings and the changelog name pages by their path."""
-    files = [
-        path
-        for name in (*PACKAGES, "benchmarks", "examples")
-        for path in (ROOT / name).rglob("*.py")
-    ]
-    files += [
-        ROOT / "CHANGELOG.md",
-        ROOT / "Makefile",
-        ROOT / "SECURITY.md",
-    ]
-    named = {
-        (page, path.name)
-        for path in files
-        for page in re.findall(r"\bdocs/[a-z][\w/-]+\.md\b", path.read_text("utf-8"))
-    }
-    assert len(named) > 10
-    assert {(page, path) for page, path in named if not (ROOT / page).is_file()} == set()
+    files = [ROOT / "CHANGELOG.md", ROOT / "Makefile", ROOT / "SECURITY.md"]
+    for folder in (*PACKAGES, "benchmarks", "examples"):
+        files += (ROOT / folder).rglob("*.py")
+    page_name = re.compile(r"\bdocs/[a-z][\w/-]+\.md\b")
+    mentions = {path: page_name.findall(path.read_text("utf-8")) for path in files}
+
+    assert sum(map(len, mentions.values())) > 10
+    for path, names in mentions.items():
+        assert [name for name in names if not (ROOT / name).is_file()] == [], path
 
 
 PYTHON_EXAMPLES_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
@@ -415,17 +442,19 @@ PYTHON_EXAMPLES_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text
 
 def test_every_function_has_an_example() -> None:
     """Each entry of a function is followed by a session; methods may do without."""
-    entries = re.findall(r"^- `(\w+)\(.*\n((?:  .*\n)*)", PYTHON_EXAMPLES_PAGE, re.MULTILINE)
-    shown = {name: ">>> " in text for name, text in entries if hasattr(era_haptics, name)}
-    assert len(shown) > 15
-    assert [name for name, has_example in shown.items() if not has_example] == []
+    entry = re.compile(r"^- `(\w+)\(.*\n((?:  .*\n)*)", re.MULTILINE)
+    entries = dict(entry.findall(PYTHON_EXAMPLES_PAGE))
+    functions = [name for name in entries if hasattr(era_haptics, name)]
+
+    assert len(functions) > 15
+    assert [name for name in functions if ">>> " not in entries[name]] == []
 
 
 @pytest.mark.long
-def test_examples_print_what_the_page_shows(
+def test_python_examples_print_the_output_of_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the order of the page, from a folder beside the examples."""
+    """In the order of the page, from a folder next to the examples."""
     shutil.copytree(
         ROOT / "examples",
         tmp_path / "examples",
@@ -456,7 +485,7 @@ Figure()
 '''
 
 
-def test_a_notebook_is_shown_with_what_it_prints_and_draws(
+def test_notebook_becomes_a_page_with_its_output_and_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Text as text, a cell with its output, and a figure that ends a cell as a picture."""
@@ -464,11 +493,13 @@ def test_a_notebook_is_shown_with_what_it_prints_and_draws(
     pictures = tmp_path / "docs"
     pictures.mkdir()
     (tmp_path / "small.py").write_text(NOTEBOOK, "utf-8")
-    shown = notebooks.as_markdown(tmp_path / "small.py", pictures)
-    title, code, printed, figure, picture = shown.split("\n\n")
+
+    page = notebooks.as_markdown(tmp_path / "small.py", pictures)
+
+    title, code, output, figure, picture = page.split("\n\n")
     assert title == "# A title"
     assert 'print("seen")' in code
-    assert printed == "````text\nseen\n````"
+    assert output == "````text\nseen\n````"
     assert "Figure()" in figure
     assert picture == "![The figure of this cell](/small-2.png)"
     assert (pictures / "small-2.png").read_bytes().startswith(b"\x89PNG")

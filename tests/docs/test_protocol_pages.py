@@ -94,66 +94,80 @@ BY_HAND = {
 }
 
 
-def frames(text: str) -> list[str]:
-    """What goes over the line, a string for each frame; long ones go on in lines of their own."""
+def frames_of(text: str) -> list[str]:
+    """The frames on the line, one string per frame; long frames continue on indented lines."""
     return re.sub(r"\n {2}", " ", text).strip().splitlines()
 
 
-def shown(page: str, title: str) -> list[str]:
+def page_frames(page: str, title: str) -> list[str]:
     """The frames that `make pages` writes below a title of a page."""
     text = "\n".join(textwrap.dedent(write()) for write in BYTES[page].values())
-    return frames(text.split(f"# {title}\n")[1].partition("\n#")[0])
+    _, section = text.split(f"# {title}\n")
+    return frames_of(section.partition("\n#")[0])
 
 
-def listed_words() -> dict[str, list[int]]:
-    """The words that protocol.md lists, by message: of the set those of its last part."""
+def words_of_page() -> dict[str, list[int]]:
+    """The words that protocol.md lists, by message: those of the last part of the set."""
     messages: dict[str, list[int]] = {}
     name = ""
-    for words, text in re.findall(
-        r"^    ((?:[0-9A-F]{4} )+) +(.*)$", BYTES["protocol"]["join"](), re.MULTILINE
-    ):
-        title = re.match(r"(Set|Taken|Commit|Status): ", text)
-        name = title[1] if title else name
-        row = [int(word, 16) for word in words.split()]
-        messages[name] = row if title else [*messages[name], *row]
+    row = re.compile(r"^    ((?:[0-9A-F]{4} )+) +(.*)$", re.MULTILINE)
+    for words, comment in row.findall(BYTES["protocol"]["join"]()):
+        title = re.match(r"(Set|Taken|Commit|Status): ", comment)
+        if title:
+            name = title[1]
+            messages[name] = []
+        messages[name] += [int(word, 16) for word in words.split()]
     return messages
 
 
 @pytest.mark.parametrize(("page", "title"), BY_HAND)
 def test_frames_by_hand_are_those_of_both_codecs(page: str, title: str) -> None:
     """A message with many words, its reply, and a checksum where the wire has one."""
-    by_hand = frames(BY_HAND[page, title])
-    assert shown(page, title)[: len(by_hand)] == by_hand
+    expected = frames_of(BY_HAND[page, title])
+
+    assert page_frames(page, title)[: len(expected)] == expected
 
 
-def test_monitor_reads_the_frames_of_the_page_by_the_dbc() -> None:
+def test_monitor_reads_the_frames_of_the_page_with_the_dbc() -> None:
     """`cantools` finds type, number and words of the last part, as protocol.md lists them."""
     database = cantools.database.load_file(DOCS / "amplifier.dbc")
-    words: dict[str, object] = {}
-    for frame in shown("can", "Set, part 1 of 2"):
+    signals: dict[str, object] = {}
+    for frame in page_frames("can", "Set, part 1 of 2"):
         if frame.startswith(">"):
             identifier, data = int(frame[2:5], 16), bytes.fromhex(frame[6:])
-            words |= database.decode_message(identifier, data)
-    assert (words["number"], words["type"], words["words"]) == (9, "Set", 26)
-    assert [words[f"word_{at}"] for at in range(26)] == listed_words()["Set"]
+            signals |= database.decode_message(identifier, data)
+
+    assert (signals["number"], signals["type"], signals["words"]) == (9, "Set", 26)
+    assert [signals[f"word_{number}"] for number in range(26)] == words_of_page()["Set"]
 
 
-def test_master_finds_the_objects_of_the_eds_in_the_amplifier() -> None:
-    """`canopen` reads it; every object has the subindices and sizes that the far end serves."""
-    sheet = canopen.import_od(str(DOCS / "amplifier.eds"), node_id=1)
+@pytest.fixture(scope="module")
+def eds() -> canopen.ObjectDictionary:
+    """The sheet as a CANopen master reads it."""
+    return canopen.import_od(str(DOCS / "amplifier.eds"), node_id=1)
+
+
+def test_amplifier_serves_the_objects_of_the_eds(eds: canopen.ObjectDictionary) -> None:
+    """Every object has the subindices and sizes of the sheet."""
     objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
-    for index, entry in sheet.items():
-        if index < 0x1000:
-            continue
+    own_objects = {index: entry for index, entry in eds.items() if index >= 0x1000}
+    for index, entry in own_objects.items():
         if isinstance(entry, canopen.objectdictionary.ODVariable):
-            assert len(objects.read(index, 0, 0.0)) == len(entry) // 8
+            assert len(objects.read(index, 0, 0.0)) == len(entry) // 8, hex(index)
             continue
-        assert objects.read(index, 0, 0.0)[0] == len(entry) - 1 == max(entry)
-        for subindex, each in entry.items():
-            served = objects.read(index, subindex, 0.0)
-            if each.data_type != canopen.objectdictionary.VISIBLE_STRING:
-                assert len(served) == len(each) // 8
-    number = list(sheet[0x2001].names).index("limits 3 level_max")
+        highest_subindex = objects.read(index, 0, 0.0)[0]
+        assert highest_subindex == len(entry) - 1 == max(entry), hex(index)
+        for subindex, variable in entry.items():
+            value = objects.read(index, subindex, 0.0)
+            if variable.data_type != canopen.objectdictionary.VISIBLE_STRING:
+                assert len(value) == len(variable) // 8, (hex(index), subindex)
+
+
+def test_limit_of_the_eds_has_the_value_of_the_amplifier(eds: canopen.ObjectDictionary) -> None:
+    """The largest level of channel 3 is 1, in steps of 0.0001."""
+    objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
+    number = list(eds[0x2001].names).index("limits 3 level_max")
+
     assert int.from_bytes(objects.read(0x2001, number, 0.0), "little") == 10000
 
 
@@ -161,36 +175,39 @@ PAGE = (DOCS / "protocol.md").read_text("utf-8")
 
 
 def rows_of(heading: str) -> list[list[str]]:
-    """The cells of the table of protocol.md whose first row begins so, without its head."""
+    """The cells of the table of protocol.md with this heading, without its first rows."""
     table = PAGE.split(f"\n| {heading}")[1].partition("\n\n")[0]
     return [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
 
 
-SETS = (
-    [LayerSet(0, 20, 0, (Command(0, 2200, 8000, 0),))],
-    [LayerSet(0, 20, 0, (Command(0, 2200, 3000, 9000, onset=Envelope(100, ((6000, 0),))),))],
-    [
-        LayerSet(0, 0, 0, (Command(0, 2200, 8000, 0),)),
-        LayerSet(0, 20, 0, (Command(0, 3000, 4000, 0),)),
-    ],
-    [
-        LayerSet(0, 0, 0, (Command(0, 2200, 8000, 0),)),
-        LayerSet(0, 20, 0, (Command(0, 2200, 6000, 9000, keep_phase=True),)),
-    ],
-)
-"""What the rows of the table of levels say."""
+def play(ramp: int, *command: int, **options: Any) -> LayerSet:
+    """A set with one command for channel 0: frequency, level and phase."""
+    return LayerSet(0, ramp, 0, (Command(0, *command, **options),))
+
+
+# The sets that the rows of the table of levels describe.
+SETS = [
+    [play(20, 2200, 8000, 0)],
+    [play(20, 2200, 3000, 9000, onset=Envelope(100, ((6000, 0),)))],
+    [play(0, 2200, 8000, 0), play(20, 3000, 4000, 0)],
+    [play(0, 2200, 8000, 0), play(20, 2200, 6000, 9000, keep_phase=True)],
+]
 
 
 @pytest.mark.parametrize(("number", "sets"), [*enumerate(SETS)])
 def test_levels_by_hand_are_those_of_the_playback(number: int, sets: list[LayerSet]) -> None:
     """A row of the page, calculated by its two formulas: a level every 5 ms."""
-    _, *levels = rows_of("level of the channel after")[number]
+    _, *cells = rows_of("level of the channel after")[number]
     playback = Playback(1, 8)
-    for token, one in enumerate(sets, 1):
-        playback.commit([one], token, 0.0)
-    for at, level in enumerate(map(float, levels)):
-        playback.advance(0.005 * at)
-        assert playback.level(0, 0.005 * at) == pytest.approx(level, abs=6e-5)
+    for token, layer_set in enumerate(sets, 1):
+        playback.commit([layer_set], token, 0.0)
+
+    levels = []
+    for step in range(len(cells)):
+        playback.advance(0.005 * step)
+        levels.append(playback.level(0, 0.005 * step))
+
+    assert levels == pytest.approx([float(cell) for cell in cells], abs=6e-5)
 
 
 def test_timeline_is_that_of_the_playback() -> None:
@@ -202,15 +219,17 @@ def test_timeline_is_that_of_the_playback() -> None:
     playback, onset = Playback(1, 8), Envelope(200, ((5000, 0), (8000, 0)))
     playback.commit([LayerSet(0, 0, 200, (Command(0, 2200, 6000, 0, onset=onset),))], 1, 0.0)
     playback.commit([LayerSet(0, 10, 100, (Command(0, 2200, 3000, 0),), after=True)], 2, 0.03)
-    tokens = {}
-    for moment in (0.03, 0.0599, 0.0601, 0.119):
-        playback.advance(moment)
-        tokens[moment] = playback.tokens.get(0, 0)
+
+    def tokens_at(*moments: float) -> list[int]:
+        tokens = []
+        for moment in moments:
+            playback.advance(moment)
+            tokens.append(playback.tokens.get(0, 0))
+        return tokens
+
+    assert tokens_at(0.03, 0.0599, 0.0601, 0.119) == [1, 1, 2, 2]
     playback.commit([LayerSet(0, 0, 100, renew=True)], 3, 0.12)
-    for moment in (0.161, 0.2199, 0.2201):
-        playback.advance(moment)
-        tokens[moment] = playback.tokens.get(0, 0)
-    assert [*tokens.values()] == [1, 1, 2, 2, 2, 2, 0]
+    assert tokens_at(0.161, 0.2199, 0.2201) == [2, 2, 0]
     assert playback.silent_from == pytest.approx(0.23)
 
 
@@ -224,20 +243,25 @@ def test_angles_by_hand_are_those_of_the_voices() -> None:
         turns = hertz * seconds % 1
         assert int(product, 16) / 2**32 == pytest.approx(turns, abs=1e-6)
         assert float(angle.rstrip("°")) == pytest.approx(360 * turns, abs=5e-3)
-        unit = 1e-3 if since.endswith("ms") else 1.0
-        assert float(since.split()[0]) * unit == pytest.approx(seconds, rel=1e-3)
+        number, unit = since.split()
+        page_seconds = float(number) * (1e-3 if unit == "ms" else 1.0)
+        assert page_seconds == pytest.approx(seconds, rel=1e-3)
 
 
+# Headings of the page without a rule of their own for amplifiers.
 UNCHECKED = {"terms", "example", "encoding", "messages", "output", "memory", "the-host"}
-"""Headings of the page without rules of an amplifier that another heading lacks."""
 
 
 def test_every_section_with_rules_has_a_check() -> None:
-    """By the anchors that checks refer to, which a vendor follows from a failure."""
+    """A vendor follows the anchor from a failed check to the page."""
     headings = re.findall(r"^##+ (.*)$", PAGE, re.MULTILINE)
     anchors = {heading.lower().replace(" ", "-") for heading in headings}
-    places = [check.place.split("#") for check in CHECKS]
-    checked = {anchor for page, anchor in places if page == "protocol.md"}
+    checked = set()
+    for check in CHECKS:
+        page, anchor = check.place.split("#")
+        if page == "protocol.md":
+            checked.add(anchor)
+
     assert len(checked) > 15
     assert checked == anchors - UNCHECKED
 
@@ -245,25 +269,18 @@ def test_every_section_with_rules_has_a_check() -> None:
 SHEET = json.loads((DOCS / "amplifier.json").read_text("utf-8"))
 
 
+PARTS = {"Layer": LAYER, "Command": COMMAND, "Envelope": ENVELOPE, "Knot": KNOT}
 RECORDS: dict[str, tuple[list[Any], Record]] = {
     "Hello": (SHEET["messages"]["Hello"]["reply"], IDENTITY),
     "Event": (SHEET["messages"]["Event"]["reply"], EVENT_RECORD),
     "Nak": (SHEET["messages"]["Nak"]["reply"], NAK_RECORD),
-    **{
-        name: (SHEET["records"][name.lower()], record)
-        for name, record in {
-            **{"Layer": LAYER, "Command": COMMAND, "Envelope": ENVELOPE, "Knot": KNOT}
-        }.items()
-    },
-    **{
-        f"{name}, request": (SHEET["messages"][name]["request"], m.request)
-        for name, m in MESSAGES.items()
-    },
-    **{
-        f"{name}, reply": (SHEET["messages"][name]["reply"], m.reply)
-        for name, m in MESSAGES.items()
-    },
 }
+for name, record in PARTS.items():
+    RECORDS[name] = (SHEET["records"][name.lower()], record)
+for name, message in MESSAGES.items():
+    entry = SHEET["messages"][name]
+    RECORDS[f"{name}, request"] = (entry["request"], message.request)
+    RECORDS[f"{name}, reply"] = (entry["reply"], message.reply)
 ROWS = 3
 
 
@@ -290,7 +307,7 @@ def packed(fields: list[Any], values: Mapping[str, Any]) -> list[int]:
             case "rows":
                 words += [word for row in value for word in packed(field["fields"], row)]
             case "numbers" | "words to the end":
-                words += [each & 0xFFFF for each in value]
+                words += [number & 0xFFFF for number in value]
             case kind:
                 pytest.fail(f"kind must be known, got {kind}")
     return words
@@ -328,47 +345,62 @@ def drawn(fields: list[Any], rng: random.Random) -> dict[str, Any]:
     return values
 
 
-def test_data_alone_pack_the_set_and_read_the_status_of_the_page() -> None:
-    """A reader that knows nothing but amplifier.json makes the bytes of serial.md by COBS and CRC.
+def serial_frame(message: Mapping[str, Any], words: list[int], sequence: int) -> bytes:
+    """A frame on the serial line with COBS and CRC, by amplifier.json alone."""
+    line = SHEET["serial"]
+    header = {"type": message["number"], "version": SHEET["version"], "address": 1}
+    header["sequence"] = sequence
+    frame = b""
+    for field in line["fields"]:
+        match field["name"]:
+            case "payload":
+                frame += b"".join(word.to_bytes(2, line["byte_order"]) for word in words)
+            case "crc":
+                frame += zlib.crc32(frame).to_bytes(field["bytes"], line["byte_order"])
+            case name:
+                frame += header[name].to_bytes(field["bytes"], line["byte_order"])
+    pieces = [bytes([len(piece) + 1]) + piece for piece in frame.split(b"\0")]
+    return bytes([0, *b"".join(pieces), 0])
+
+
+def test_set_is_packed_from_the_data_alone() -> None:
+    """A program that reads nothing but amplifier.json makes the bytes of serial.md.
 
     The last part of the set: layer 1 with an onset, layer 2 silenced, layer 3 renewed.
     """
-    record, line, set_ = SHEET["records"], SHEET["serial"], SHEET["messages"]["Set"]
-    loud = {"channel": 0, "onset": 1, "frequency": 4800, "level": 2500, "phase": 0}
-    stream = [
-        *packed(record["layer"], {"layer": 1, "count": 2, "ramp": 20, "valid_for": 500}),
-        *packed(record["command"], loud),
-        *packed(record["envelope"], {"knots": 2, "step": 50}),
-        *packed(record["knot"], {"level": 1000, "phase": 9000}),
-        *packed(record["knot"], {"level": 3000, "phase": -1}),
-        *packed(
-            record["command"], {"channel": 1, "frequency": 4800, "level": 1200, "phase": -1000}
-        ),
-        *packed(record["layer"], {"layer": 2, "ramp": 10, "valid_for": 0}),
-        *packed(record["layer"], {"layer": 3, "renew": 1, "ramp": 0, "valid_for": 800}),
+    rows: list[tuple[str, dict[str, int]]] = [
+        ("layer", {"layer": 1, "count": 2, "ramp": 20, "valid_for": 500}),
+        ("command", {"channel": 0, "onset": 1, "frequency": 4800, "level": 2500, "phase": 0}),
+        ("envelope", {"knots": 2, "step": 50}),
+        ("knot", {"level": 1000, "phase": 9000}),
+        ("knot", {"level": 3000, "phase": -1}),
+        ("command", {"channel": 1, "frequency": 4800, "level": 1200, "phase": -1000}),
+        ("layer", {"layer": 2, "ramp": 10, "valid_for": 0}),
+        ("layer", {"layer": 3, "renew": 1, "ramp": 0, "valid_for": 800}),
     ]
+    stream: list[int] = []
+    for name, values in rows:
+        stream += packed(SHEET["records"][name], values)
+    message = SHEET["messages"]["Set"]
     head = {"session": 0x2A17, "token": 0x0102, "index": 1, "parts": 2, "now": 0}
-    words = packed(set_["request"], {**head, "stream": stream})
-    contents = {"type": set_["number"], "version": SHEET["version"], "address": 1, "sequence": 9}
-    frame = b""
-    for field in line["fields"]:
-        if field["name"] == "payload":
-            frame += b"".join(word.to_bytes(2, line["byte_order"]) for word in words)
-        elif field["name"] == "crc":
-            frame += zlib.crc32(frame).to_bytes(field["bytes"], line["byte_order"])
-        else:
-            frame += contents[field["name"]].to_bytes(field["bytes"], line["byte_order"])
-    stuffed = b"".join(bytes([len(piece) + 1]) + piece for piece in frame.split(b"\0"))
-    sent = f"> {bytes([0, *stuffed, 0]).hex(' ').upper()}"
-    assert sent == shown("serial", "Set, part 1 of 2")[0]
 
+    frame = serial_frame(message, packed(message["request"], {**head, "stream": stream}), 9)
+
+    assert f"> {frame.hex(' ').upper()}" == page_frames("serial", "Set, part 1 of 2")[0]
+
+
+def test_status_is_packed_from_the_data_alone() -> None:
+    """The words of protocol.md, which further readings follow."""
     status = {"state": SHEET["states"]["OPERATION_ENABLED"], "fault": 0, "flags": 1, "latch": 0}
     status |= {"watchdog_left": 250, "temperature": 250, "high_voltage": 1800}
     status |= {"clock": 0x60000000, "token": 0x0102, "channels": 4, "layers": 8}
-    tokens = [0x0102, 0x0102, 0, 0x0101, 0, 0, 0, 0]
-    first = [each for each in SHEET["messages"]["GetStatus"]["reply"] if not each.get("added")]
-    words = packed(first, {**status, "levels": [3300, 3200, 0, 0], "tokens": tokens})
-    assert words == listed_words()["Status"][: len(words)]  # readings that were added follow
+    columns = {"levels": [3300, 3200, 0, 0], "tokens": [0x0102, 0x0102, 0, 0x0101, 0, 0, 0, 0]}
+    reply = SHEET["messages"]["GetStatus"]["reply"]
+    first_fields = [field for field in reply if not field.get("added")]
+
+    words = packed(first_fields, {**status, **columns})
+
+    assert words == words_of_page()["Status"][: len(words)]
 
 
 @pytest.mark.parametrize("name", RECORDS)
@@ -381,26 +413,41 @@ def test_every_record_is_read_as_the_data_pack_it(name: str) -> None:
         assert record.unpack(packed(fields, values), is_strict=True) == values
 
 
-def test_numbers_and_names_are_all_there() -> None:
-    """Of messages, quantities, states, faults, codes, features, flags and units."""
+def test_data_list_every_message() -> None:
+    """With its number, and whether it feeds the watchdog and can be broadcast."""
     numbers = {"Hello": HELLO, "Event": EVENT, "Nak": NAK}
-    numbers |= {name: each.number for name, each in MESSAGES.items()}
-    assert {name: each["number"] for name, each in SHEET["messages"].items()} == numbers
-    for name, each in MESSAGES.items():
-        listed = SHEET["messages"][name]
-        assert (listed["feeds"], listed["broadcast"]) == (each.feeds, each.is_broadcast)
+    numbers |= {name: message.number for name, message in MESSAGES.items()}
+
+    assert {name: entry["number"] for name, entry in SHEET["messages"].items()} == numbers
+    for name, message in MESSAGES.items():
+        entry = SHEET["messages"][name]
+        assert (entry["feeds"], entry["broadcast"]) == (message.feeds, message.is_broadcast), name
+
+
+def test_data_list_every_quantity() -> None:
+    """With its type, unit and scale."""
     assert SHEET["quantities"].keys() == QUANTITIES.keys()
     for name, quantity in QUANTITIES.items():
-        listed = SHEET["quantities"][name]
+        entry = SHEET["quantities"][name]
+        assert (entry["type"], entry["unit"]) == (quantity.wire, quantity.unit), name
         for integer in (quantity.minimum, quantity.maximum):
-            value = (integer - listed["zero"]) / listed["per_unit"]
-            assert value == pytest.approx(quantity.from_wire(integer))
-        assert (listed["type"], listed["unit"]) == (quantity.wire, quantity.unit)
-    tables = {"states": STATES, "faults": FAULTS, "codes": REFUSALS, "features": FEATURES}
-    tables["status_flags"] = STATUS_FLAGS
-    assert {name: SHEET[name] for name in tables} == {
-        name: json.loads(json.dumps(each)) for name, each in tables.items()
-    }
+            value = (integer - entry["zero"]) / entry["per_unit"]
+            assert value == pytest.approx(quantity.from_wire(integer)), name
+
+
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [
+        ("states", STATES),
+        ("faults", FAULTS),
+        ("codes", REFUSALS),
+        ("features", FEATURES),
+        ("status_flags", STATUS_FLAGS),
+    ],
+)
+def test_data_list_every_name_of_a_table(name: str, table: object) -> None:
+    """States, faults, codes, features and flags."""
+    assert SHEET[name] == json.loads(json.dumps(table))
 
 
 def test_check_of_serial_frames_follows_from_its_parameters() -> None:
@@ -416,33 +463,50 @@ def test_check_of_serial_frames_follows_from_its_parameters() -> None:
     assert register ^ crc["xor"] == crc["check"] == zlib.crc32(b"123456789")
 
 
-def test_registers_hold_what_the_layout_lists() -> None:
-    """A commit of modbus.md: registers of its number, a tag before the request and its reply."""
-    sheet = SHEET["modbus"]
-    for name, each in sheet["registers"].items():
+def test_messages_have_the_registers_of_their_number() -> None:
+    """Requests begin at 0x100 times the number, replies 0x80 after."""
+    for name, registers in SHEET["modbus"]["registers"].items():
         number = SHEET["messages"][name]["number"]
-        assert each == {"written_from": 0x100 * number, "reply_from": 0x100 * number + 0x80}
-    written = bytes.fromhex("0600 0004 08 0001 2A17 0102 6000")  # place, count, bytes, registers
-    assert struct.unpack_from(">H", written)[0] == sheet["registers"]["Commit"]["written_from"]
-    tag, *words = struct.unpack_from(">4H", written, 5)
-    assert sheet["layout"]["written"] == ["tag", "words of the request"]
-    assert (tag, MESSAGES["Commit"].request.unpack(words, is_strict=True)) == (
-        *(1, {"session": 0x2A17, "token": 0x0102, "at": 0x6000}),
-    )
+        expected = {"written_from": 0x100 * number, "reply_from": 0x100 * number + 0x80}
+        assert registers == expected, name
+
+
+def test_commit_of_the_page_has_the_written_layout() -> None:
+    """Address, count, bytes and registers: a tag before the words of the request."""
+    frame = bytes.fromhex("0600 0004 08 0001 2A17 0102 6000")
+    (address,) = struct.unpack_from(">H", frame)
+    tag, *words = struct.unpack_from(">4H", frame, 5)
+
+    request = MESSAGES["Commit"].request.unpack(words, is_strict=True)
+
+    assert SHEET["modbus"]["layout"]["written"] == ["tag", "words of the request"]
+    assert address == SHEET["modbus"]["registers"]["Commit"]["written_from"]
+    assert tag == 1
+    assert request == {"session": 0x2A17, "token": 0x0102, "at": 0x6000}
+
+
+def test_reply_of_the_page_has_the_layout_of_replies() -> None:
+    """Tag and result before the words of the reply."""
     tag, result, *words = struct.unpack(">5H", bytes.fromhex("0002 0000 0102 0006 0000"))
-    assert [each.partition(":")[0] for each in sheet["layout"]["reply"]] == [
-        *("tag", "result", "words of the reply", "zeros"),
-    ]
+
     taken = MESSAGES["Set"].reply.unpack(words, is_strict=False)
-    assert (tag, result, taken["token"], taken["staged"], taken["played"]) == (2, 0, 0x0102, 1, 0)
+
+    layout = [part.partition(":")[0] for part in SHEET["modbus"]["layout"]["reply"]]
+    assert layout == ["tag", "result", "words of the reply", "zeros"]
+    assert (tag, result) == (2, 0)
+    assert (taken["token"], taken["staged"], taken["played"]) == (0x0102, 1, 0)
 
 
-def test_each_read_of_the_status_object_is_a_status() -> None:
-    """It uses up a Mark, as can.md says: the next subindex is of its own moment."""
+def test_each_read_of_the_status_object_is_a_new_status() -> None:
+    """It uses up a Mark, as can.md says: the next subindex has its own moment."""
     amplifier = SimulatedAmplifier("a", channels=4)
     objects = ObjectServer(amplifier, 1)
-    (high,) = (at for at, word in enumerate(listed_words()["Status"], 1) if word == 0x6000)
+    clock_subindex = words_of_page()["Status"].index(0x6000) + 1
     amplifier.handle("Mark", {}, 1.0)
     amplifier.withdraw_status()  # for all, without a reply
-    shown = [int.from_bytes(objects.read(0x2002, high, 3.0), "little") for _ in range(2)]
-    assert [round(each * 20 / 65536) for each in shown] == [1, 3]
+
+    first_reading = objects.read(0x2002, clock_subindex, 3.0)
+    second_reading = objects.read(0x2002, clock_subindex, 3.0)
+
+    readings = [int.from_bytes(data, "little") for data in (first_reading, second_reading)]
+    assert [round(reading * 20 / 65536) for reading in readings] == [1, 3]

@@ -64,22 +64,21 @@ def test_commands_print_no_control_characters_of_files_and_arguments(
     daemon = f'rig: {example_rig_path()}\nsocket: "\\e[2J.sock"\n'
     (tmp_path / "daemon.yaml").write_text(daemon, "utf-8")
     (tmp_path / "broken.yaml").write_text('rig: "\\e[2J\\u202e.yaml"\n', "utf-8")
-    done = typed(command, tmp_path)
-    assert done.returncode == status
-    assert re.search(rb"\\x1b\[2J", done.stdout + done.stderr)
-    assert not CONTROL.search(done.stdout + done.stderr)
+    result = typed(command, tmp_path)
+    assert result.returncode == status
+    assert re.search(rb"\\x1b\[2J", result.stdout + result.stderr)
+    assert not CONTROL.search(result.stdout + result.stderr)
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
 def test_command_writes_its_file_when_streams_are_closed(tmp_path: Path, closed: str) -> None:
     """As of services and programs with windows; nothing goes into a file in place of a stream."""
     build = f"table build {RIG} --frequencies 60:120:60 --grid 2x2 --mesh 6x5"
-    done = typed(f"{ERA} {build} -o table.npz {closed}", tmp_path)
-    assert done.returncode == 0
-    assert b"bug" not in done.stderr
+    result = typed(f"{ERA} {build} -o table.npz {closed}", tmp_path)
+    assert result.returncode == 0
+    assert b"bug" not in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["table.npz"]
-    shown = typed(f"{ERA} table show table.npz", tmp_path)
-    assert shown.returncode == 0
+    assert typed(f"{ERA} table show table.npz", tmp_path).returncode == 0
 
 
 def test_closed_streams_keep_their_numbers(tmp_path: Path) -> None:
@@ -89,16 +88,16 @@ def test_closed_streams_keep_their_numbers(tmp_path: Path) -> None:
         "file = open('data', 'wb'); os.write(1, b'lost'); os.write(2, b'lost'); "
         "assert os.read(0, 1) == b''; file.close()"
     )
-    done = typed(f'{shlex.quote(sys.executable)} -c "{program}" <&- >&- 2>&-', tmp_path)
-    assert done.returncode == 0
+    result = typed(f'{shlex.quote(sys.executable)} -c "{program}" <&- >&- 2>&-', tmp_path)
+    assert result.returncode == 0
     assert (tmp_path / "data").read_bytes() == b""
 
 
 def test_command_says_that_its_output_cannot_be_written(tmp_path: Path) -> None:
     """A standard output that is open for reading alone is named, and is no bug."""
-    done = typed(f"{ERA} plate modes {RIG} --json 1</dev/null", tmp_path)
-    assert done.returncode == 2
-    assert re.fullmatch(rb"era: error: standard output cannot be written;[^\n]*\n", done.stderr)
+    result = typed(f"{ERA} plate modes {RIG} --json 1</dev/null", tmp_path)
+    assert result.returncode == 2
+    assert re.fullmatch(rb"era: error: standard output cannot be written;[^\n]*\n", result.stderr)
 
 
 def test_library_draws_on_a_protected_stream(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import gc
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from itertools import islice
 
 import pytest
@@ -31,7 +31,7 @@ async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
         opener = threading.current_thread()
 
         def cancel_next() -> None:
-            opener.join()  # so that what it gives is before the cancellation, and nothing between
+            opener.join()  # so that its result precedes the cancellation, with nothing between
             loop.call_soon(opening.cancel)
 
         loop.call_soon_threadsafe(cancel_next)
@@ -63,10 +63,10 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
 
 
 @pytest.mark.parametrize("executor", [None, DaemonThreads()], ids=["in_thread", "executor"])
-async def test_awaiter_learns_when_work_tries_to_end_the_program(
+async def test_awaiter_gets_an_error_when_work_tries_to_end_the_program(
     executor: DaemonThreads | None,
 ) -> None:
-    """A plug-in that calls sys.exit(3) fails as any other, and nothing waits for it."""
+    """A plug-in that calls sys.exit(3) fails like any other, and nothing waits for it."""
 
     def leave() -> None:
         sys.exit(3)
@@ -82,12 +82,18 @@ async def test_awaiter_learns_when_work_tries_to_end_the_program(
 
 def test_work_counts_before_its_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if the scheduler has not run the thread yet when the program ends."""
-    waiting = []
-    monkeypatch.setattr("_thread.start_new_thread", lambda run, given: waiting.append((run, given)))
+    starts = []
+
+    def start_later(function: Callable[..., object], arguments: tuple[object, ...]) -> None:
+        starts.append((function, arguments))
+
+    monkeypatch.setattr("_thread.start_new_thread", start_later)
+
     DaemonThreads().submit(int)
+
     assert are_at_work()
-    ((run, given),) = waiting
-    run(*given)
+    ((function, arguments),) = starts
+    function(*arguments)
     assert not are_at_work()
 
 
@@ -127,10 +133,11 @@ def test_pauses_grow_up_to_a_limit() -> None:
 
 
 def test_backoff_resets_after_a_good_minute() -> None:
-    """1, 2, 4, 5, 5 s, and 1 s again after what ran for a minute."""
+    """1, 2, 4, 5, 5 s, and 1 s again after a run of a minute."""
     backoff = Backoff(first=1.0, maximum=5.0)
     assert [backoff.pause(ran_for=59.9) for _ in range(5)] == [1, 2, 4, 5, 5]
-    assert [backoff.pause(ran_for=each) for each in (60.0, 0.0)] == [1, 2]
+    assert backoff.pause(ran_for=60.0) == 1
+    assert backoff.pause(ran_for=0.0) == 2
 
 
 def test_present_objects_are_frozen_during_the_context() -> None:
@@ -148,15 +155,15 @@ def test_objects_built_without_collections_are_never_visited() -> None:
             gc.unfreeze()
             with without_collections():
                 assert not gc.isenabled()
-                built = [[number] for number in range(count)]
+                objects = [[number] for number in range(count)]
             assert gc.isenabled()
-            assert (gc.get_freeze_count() >= len(built)) is is_frozen
+            assert (gc.get_freeze_count() >= len(objects)) is is_frozen
     finally:
         gc.unfreeze()
 
 
 @pytest.mark.parametrize(
-    ("name", "known", "meant"),
+    ("name", "choices", "suggestion"),
     [
         ("aluminum", ["steel", "aluminium"], "did you mean aluminium? "),
         ("sw", ["SW", "SE"], "did you mean SW? "),
@@ -173,9 +180,11 @@ def test_objects_built_without_collections_are_never_visited() -> None:
         ("x", [], ""),
     ],
 )
-def test_did_you_mean_suggests_similar_names(name: str, known: list[str], meant: str) -> None:
+def test_did_you_mean_suggests_similar_names(
+    name: str, choices: list[str], suggestion: str
+) -> None:
     """Mistyped names, another case and one word of a name are understood."""
-    assert did_you_mean(name, known) == meant
+    assert did_you_mean(name, choices) == suggestion
 
 
 def test_did_you_mean_ignores_a_common_ending() -> None:

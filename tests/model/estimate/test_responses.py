@@ -39,10 +39,12 @@ def test_loss_factor_of_a_viscous_plate_is_within_its_standard_error() -> None:
     frequencies = np.arange(41.0, 500.0, 20.0)
     truth = draw_truth(rig, seed=2)
     strokes = np.array([era.stroke for era in rig.eras])
-    exact = DeskModel(truth, points).under().response(frequencies) / strokes
+    desk = DeskModel(truth, points).under()
+    exact = desk.response(frequencies) / strokes
     sizes = np.sqrt((np.abs(exact) ** 2).mean(axis=1, keepdims=True))
     noise = np.random.default_rng(5).standard_normal((*exact.shape, 2)) @ [1, 1j]
-    responses = Measurement(sensors_at(points), frequencies, exact + 1e-3 * sizes * noise)
+    values = exact + 1e-3 * sizes * noise
+    responses = Measurement(sensors_at(points), frequencies, values)
 
     calibration = calibrate(rig, responses)
 

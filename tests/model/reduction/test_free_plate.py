@@ -60,7 +60,8 @@ MESHES = {
 
 def assert_within(response: ComplexArray, expected: ComplexArray, tolerance: float) -> None:
     """Compare responses of each ERA at each frequency, relative in the norm over the points."""
-    errors = np.linalg.norm(response - expected, axis=2) / np.linalg.norm(expected, axis=2)
+    differences = np.linalg.norm(response - expected, axis=2)
+    errors = differences / np.linalg.norm(expected, axis=2)
     np.testing.assert_allclose(errors, 0, atol=tolerance, err_msg="by frequency and ERA")
 
 
@@ -181,7 +182,6 @@ UNDAMPED_ERAS = (
 )
 BLOCK = Plate(0.3, 0.2, 0.02, ALUMINIUM)
 BAR = Plate(1.0, 0.02, 0.002, ALUMINIUM)
-STANDING_BAR = Plate(0.05, 0.4, 0.002, ALUMINIUM)
 TINY = Plate(0.03, 0.03, 0.002, ALUMINIUM)
 OPEN_AIR = replace(PANE, air_gap=AirGap(5e-3))
 SEALED_AIR = replace(PANE, air_gap=AirGap(5e-3, closed=True))
@@ -192,11 +192,7 @@ CASES = {
     "undamped": Case(UNDAMPED, elements(UNDAMPED, 24, 18), UNDAMPED_ERAS),
     "block that only rocks": Case(BLOCK, elements(BLOCK, 3, 3, "Q4"), eras_at(BLOCK, *WITHIN)),
     "bar": Case(BAR, elements(BAR, 60, 3), eras_at(BAR, *TWO_SHARES)),
-    "standing bar": Case(
-        STANDING_BAR, elements(STANDING_BAR, 4, 40), eras_at(STANDING_BAR, *TWO_SHARES)
-    ),
     "one element": Case(TINY, elements(TINY, 1, 1), eras_at(TINY, *TWO_SHARES)),
-    "two elements": Case(TINY, elements(TINY, 2, 1), eras_at(TINY, *TWO_SHARES)),
     "feet": Case(PAPER, elements(PAPER, 24, 18), eras_at(PAPER, *CORNERS, foot=0.006), (MASS,)),
     "loss that rises with frequency": Case(
         LOSSY, polynomials(LOSSY, 13, 11), eras_at(LOSSY, *WITHIN)
@@ -218,7 +214,7 @@ for name, plate, tolerance in (
 ):
     mesh, eras = polynomials(plate, 18, 12), eras_at(plate, *CORNERS)
     CASES[name] = Case(plate, mesh, eras, tolerance=tolerance)
-SHORT = set(CASES) - {"layers", "lossy layers", "standing bar", "two elements"}
+SHORT = set(CASES) - {"layers", "lossy layers"}
 
 
 @pytest.mark.parametrize("name", shortly(CASES, SHORT))
@@ -362,10 +358,13 @@ def test_reduced_plate_response_equals_direct_solve(shares):
     response = []
     for omega in 2 * np.pi * frequencies:
         springs = stiffnesses + 1j * omega * 3.5
-        attached = (at_eras.T * (springs - omega**2 * bolt_masses)) @ at_eras
-        dynamic = np.diag((1 + 0.01j) * reduced.omega**2 - omega**2) + attached
-        coordinates = np.linalg.solve(dynamic, at_eras.T * springs * 1e-4)
-        response.append(-(omega**2) * (at_nodes @ coordinates).T)
+        on_springs = springs - omega**2 * bolt_masses
+        attached = (at_eras.T * on_springs) @ at_eras
+        free_stiffness = (1 + 0.01j) * reduced.omega**2 - omega**2
+        dynamic = np.diag(free_stiffness) + attached
+        forces = at_eras.T * springs * 1e-4
+        deflections = at_nodes @ np.linalg.solve(dynamic, forces)
+        response.append(-(omega**2) * deflections.T)
     expected = direct_acceleration(assemble(PAPER, COARSE), eras, frequencies, COARSE.nodes)
     assert_within(np.array(response), expected, 3e-5)
 
@@ -490,10 +489,13 @@ def test_deviations_change_the_receptance_of_their_modes_alone(
     elastic_modes = np.argsort(free.modes.eigenvalues)[3:6]
     for mode, (shift, loss) in zip(elastic_modes, DEVIATIONS, strict=True):
         eigenvalue = free.modes.eigenvalues[mode]
-        own_stiffness = eigenvalue * np.exp(shift) * (1 + 1j * loss_factors * np.exp(loss))
+        own_losses = loss_factors * np.exp(loss)
+        own_stiffness = eigenvalue * np.exp(shift) * (1 + 1j * own_losses)
         nominal_stiffness = eigenvalue * (1 + 1j * loss_factors)
-        change = 1 / (own_stiffness - omega**2) - 1 / (nominal_stiffness - omega**2)
-        expected += change[:, None, None] * np.outer(shapes[:, mode], shapes[:, mode])
+        own_receptance = 1 / (own_stiffness - omega**2)
+        change = own_receptance - 1 / (nominal_stiffness - omega**2)
+        shape = shapes[:, mode]
+        expected += change[:, None, None] * np.outer(shape, shape)
     np.testing.assert_allclose(receptances, expected, atol=1e-12 * np.abs(expected).max())
 
 
@@ -514,14 +516,16 @@ def test_plate_in_time_has_its_deviations(deviating_rig: Rig) -> None:
     era = eras[0]
     reduced = reduce_plate(plate, mesh, footprints_of(eras))
     mass, damping, stiffness = modal_matrices(reduced, eras)
-    at_era, at_points = reduced.at(footprints_of(eras[:1]))[0], reduced.at(POINTS)
+    (at_era,) = reduced.at(footprints_of(eras[:1]))
+    at_points = reduced.at(POINTS)
 
     response = []
     for omega in 2 * np.pi * FREQUENCIES:
         force = (era.stiffness + 1j * omega * era.damping) * era.stroke
         dynamic = stiffness + 1j * omega * damping - omega**2 * mass
         coordinates = np.linalg.solve(dynamic, at_era * force)
-        response.append(-(omega**2) * at_points @ coordinates)
+        accelerations = -(omega**2) * at_points @ coordinates
+        response.append(accelerations)
 
     free = solve_free_plate(plate, mesh, frequency_max=500.0)
     expected = free.acceleration(eras, FREQUENCIES, POINTS)[:, :1]

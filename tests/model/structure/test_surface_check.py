@@ -16,8 +16,12 @@ from model.errors import InputError
 from model.files.modal_file import read_modes
 from model.rig.rig_file import load_rig, parse_rig
 
-LENGTH, WIDTH, THICKNESS = 0.4, 0.3, 3e-3
-MODULUS, POISSON, DENSITY = 70e9, 0.22, 2500.0
+LENGTH = 0.4
+WIDTH = 0.3
+THICKNESS = 3e-3
+MODULUS = 70e9
+POISSON = 0.22
+DENSITY = 2500.0
 MASS = DENSITY * LENGTH * WIDTH * THICKNESS  # 0.9 kg
 RIGIDITY = MODULUS * THICKNESS**3 / 12 / (1 - POISSON**2)
 ERAS = """
@@ -58,17 +62,21 @@ def simply_supported(positions: FloatArray) -> Modes:
     along = np.sin(np.outer(m, math.pi * x / LENGTH))
     across = np.sin(np.outer(n, math.pi * y / WIDTH))
     speed = math.sqrt(RIGIDITY / (DENSITY * THICKNESS))
-    frequencies = math.pi / 2 * (m**2 / LENGTH**2 + n**2 / WIDTH**2) * speed
-    return lowest_modes(positions, frequencies, 2 / math.sqrt(MASS) * along * across)
+    squares = (m / LENGTH) ** 2 + (n / WIDTH) ** 2
+    frequencies = math.pi / 2 * squares * speed
+    shapes = 2 / math.sqrt(MASS) * along * across
+    return lowest_modes(positions, frequencies, shapes)
 
 
 def cantilever(positions: FloatArray) -> Modes:
     """Euler and Bernoulli: a strip that is clamped at x = 0 and bends along its length alone."""
     roots = np.array([1.8751041, 4.6940911, 7.8547574, 10.9955407, 14.1371684, 17.2787596])
-    ratio = (np.cosh(roots) + np.cos(roots)) / (np.sinh(roots) + np.sin(roots))
+    even_end = np.cosh(roots) + np.cos(roots)
+    odd_end = np.sinh(roots) + np.sin(roots)
     kx = np.outer(roots, positions[:, 0] / LENGTH)
     even = np.cosh(kx) - np.cos(kx)
     odd = np.sinh(kx) - np.sin(kx)
+    ratio = even_end / odd_end
     bending = even - ratio[:, None] * odd
     speed = math.sqrt(MODULUS * THICKNESS**2 / 12 / DENSITY)
     frequencies = roots**2 / (2 * math.pi * LENGTH**2) * speed

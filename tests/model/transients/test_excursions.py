@@ -1,6 +1,7 @@
 """Magnets and exciters in time: by hand for rigid plates, by SciPy and in the frequency domain."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -14,7 +15,7 @@ from kit.plates import exciter_rig, make_paper_rig
 from model.answer.envelope import swings_of_pulse
 from model.arrays import FloatArray
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate, reduce_plate
+from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate, reduce_plate
 from model.reduction.supported_plate import modal_matrices, supported_modes
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig
@@ -81,7 +82,8 @@ def test_magnets_move_more_on_a_board_as_light_as_they_are() -> None:
     board_mass = rig.plate.mass / 4
     reduced_mass = 0.10929 * board_mass / (0.10929 + board_mass)
     damping = 0.76 + 3.63**2 / impedance
-    expected = np.abs(force / (3189 + 1j * omega * damping - omega**2 * reduced_mass))
+    dynamic_stiffness = 3189 + 1j * omega * damping - omega**2 * reduced_mass
+    expected = np.abs(force / dynamic_stiffness)
     np.testing.assert_allclose(excursions, np.tile(expected[:, None], 4), rtol=0.01)
 
 
@@ -128,17 +130,20 @@ def test_nine_of_ten_boards_stay_within_their_excursion(frequency: float) -> Non
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
     exciter = rig.eras[0]
     rng = np.random.default_rng(3)
-    carrier = np.exp(2j * np.pi * frequency * STEP * np.arange(800))
+    times = STEP * np.arange(800)
+    carrier = np.exp(2j * np.pi * frequency * times)
 
     level = magnets_of(rig, free).shares(np.array([frequency]))
     nominal_level = magnets_of(exact_rig, free).shares(np.array([frequency]))
     excursions = np.empty((16, 1))
     for board_number in range(len(excursions)):
         magnets = Magnets(varied_board(rig, rng))
-        gains = 1 + rig.uncertainty.gain * rng.standard_normal(4)
-        volts = exciter.full_level * np.diag(gains)[:, None] * carrier[:, None]
+        gain_errors = rig.uncertainty.gain * rng.standard_normal(4)
+        gains = np.diag(1 + gain_errors)
+        volts = exciter.full_level * carrier[:, None] * gains[:, None]
         motions = [np.abs(magnets.moved(era_volts)) for era_volts in volts]
-        excursions[board_number] = np.sum(motions, axis=0).max() / exciter.excursion
+        largest_motion = np.sum(motions, axis=0).max()
+        excursions[board_number] = largest_motion / exciter.excursion
 
     assert np.mean(nominal_level * excursions <= 1) < 0.5
     assert np.mean(level * excursions <= 1) >= 0.8
@@ -166,8 +171,12 @@ def test_reach_falls_with_the_power_of_an_amplifier(amplifiers: int, lower_db: f
 # Motion of a single magnet along a level
 
 # The exciter of 25 mm at 1 W, from its sheet: 27 Hz and a quality of 5 on a held coil.
-STIFFNESS, DAMPING, MAGNET_MASS = 3189.2, 0.7553, 0.10929
-FORCE_FACTOR, RESISTANCE, VOLTS = 3.63, 4.4, 3.0008
+STIFFNESS = 3189.2
+DAMPING = 0.7553
+MAGNET_MASS = 0.10929
+FORCE_FACTOR = 3.63
+RESISTANCE = 4.4
+VOLTS = 3.0008
 
 
 def magnets_on_a_heavy_board() -> MagnetMotions:
@@ -183,7 +192,8 @@ def largest_motion(frequency: float, swing: Swing) -> float:
     times = np.arange(0, ends[-1], 2e-4)
     envelope = np.interp(times, ends, swing.shares)
     carrier = np.exp(2j * math.pi * frequency * times)
-    force = FORCE_FACTOR * VOLTS / RESISTANCE * envelope * carrier
+    largest_force = FORCE_FACTOR * VOLTS / RESISTANCE
+    force = largest_force * envelope * carrier
     damping = DAMPING + FORCE_FACTOR**2 / RESISTANCE
     oscillator = ([1.0], [MAGNET_MASS, damping, STIFFNESS])
     _, real_motion, _ = lsim(oscillator, force.real, times)
@@ -195,7 +205,8 @@ def largest_motion(frequency: float, swing: Swing) -> float:
 def test_motion_along_a_swinging_level_is_that_of_one_mass(frequency: float) -> None:
     """A level that swings with the beat of drive and magnet, and a level that lasts."""
     magnets, times = magnets_on_a_heavy_board(), 0.01 * np.arange(61)
-    beating_level = (1 - np.cos(2 * math.pi * (frequency - 27.2) * times)) / 2
+    beat = 2 * math.pi * (frequency - 27.2)
+    beating_level = (1 - np.cos(beat * times)) / 2
     lasting_level = np.minimum(times / 0.01, 1)
 
     for level in (beating_level, lasting_level):
@@ -227,7 +238,9 @@ def test_repeated_pulses_are_bounded_at_the_worst_repetition_rate() -> None:
 
 # The plate in time
 
-RATE, COUNT, FINER = 5000.0, 400, 64
+RATE = 5000.0
+COUNT = 400
+FINER = 64
 
 
 def chirp(times: FloatArray) -> FloatArray:
@@ -240,6 +253,38 @@ def base_motions(oversampling: int) -> FloatArray:
     """Motions in strokes of two ERAs, the second inverted and 3 ms later."""
     times = np.arange(COUNT * oversampling) / (RATE * oversampling)
     return np.array([0.8 * chirp(times), -0.5 * chirp(times - 0.003)])
+
+
+def accelerations_by_scipy(
+    rig: Rig,
+    reduced: ReducedPlate,
+    tips: Sequence[FingertipLoad],
+    points: FloatArray,
+    driven: list[int],
+) -> FloatArray:
+    """Accelerations at points, integrated by SciPy from finely sampled motions of two ERAs."""
+    mass, damping, stiffness = modal_matrices(reduced, rig.eras, contacts=tips)
+    order = len(mass)
+    inverse = np.linalg.inv(mass)
+    zeros = np.zeros((order, order))
+    identity = np.eye(order)
+    stiffness_rows = -inverse @ stiffness
+    damping_rows = -inverse @ damping
+    A = np.block([[zeros, identity], [stiffness_rows, damping_rows]])
+    with_finger = ((0, 0), (0, 1))  # the fingertip's own coordinate comes last
+    at_all_eras = np.pad(reduced.at(footprints_of(rig.eras)), with_finger)
+    at_eras = at_all_eras[driven].T
+    springs = [rig.eras[number].stiffness for number in driven]
+    dampers = [rig.eras[number].damping for number in driven]
+    forces = np.hstack([at_eras * springs, at_eras * dampers])
+    B = np.vstack([np.zeros((order, 4)), inverse @ forces])
+    at_points = np.pad(reduced.at(points), with_finger)
+    system = StateSpace(A, B, at_points @ A[order:], at_points @ B[order:])
+    times = np.arange(COUNT * FINER) / (RATE * FINER)
+    motions = base_motions(FINER).T * rig.eras[0].stroke
+    velocities = np.gradient(motions, times, axis=0)
+    _, accelerations, _ = lsim(system, np.hstack([motions, velocities]), times)
+    return np.asarray(accelerations[::FINER])
 
 
 def test_sampled_motions_are_followed_as_scipy_integrates() -> None:
@@ -264,25 +309,9 @@ def test_sampled_motions_are_followed_as_scipy_integrates() -> None:
 
     samples, finer_samples = response(1), response(2)
 
-    mass, damping, stiffness = modal_matrices(reduced, rig.eras, contacts=tips)
-    order, inverse = len(mass), np.linalg.inv(mass)
-    zeros, identity = np.zeros((order, order)), np.eye(order)
-    A = np.block([[zeros, identity], [-inverse @ stiffness, -inverse @ damping]])
-    with_finger = ((0, 0), (0, 1))  # the fingertip's own coordinate comes last
-    at_eras = np.pad(reduced.at(footprints_of(rig.eras)), with_finger)[driven].T
-    springs = [rig.eras[number].stiffness for number in driven]
-    dampers = [rig.eras[number].damping for number in driven]
-    forces = inverse @ np.hstack([at_eras * springs, at_eras * dampers])
-    B = np.vstack([np.zeros((order, 4)), forces])
-    at_points = np.pad(reduced.at(points), with_finger)
-    accelerations = StateSpace(A, B, at_points @ A[order:], at_points @ B[order:])
-    times = np.arange(COUNT * FINER) / (RATE * FINER)
-    motions = base_motions(FINER).T * rig.eras[0].stroke
-    velocities = np.gradient(motions, times, axis=0)
-    _, expected, _ = lsim(accelerations, np.hstack([motions, velocities]), times)
-
+    expected = accelerations_by_scipy(rig, reduced, tips, points, driven)
     np.testing.assert_allclose(samples, finer_samples, atol=1e-7 * np.abs(samples).max())
-    np.testing.assert_allclose(samples, expected[::FINER], atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(samples, expected, atol=1e-4 * np.abs(expected).max())
 
 
 POINTS = np.array([[0.05, 0.05], [0.15, 0.12], [0.28, 0.2]])
@@ -318,7 +347,8 @@ def test_settled_vibration_is_that_of_the_frequency_domain(keys: str) -> None:
     for omega in 2 * math.pi * frequencies:
         settled.append(-(omega**2) * steady_states(plate, omega) @ at_points.T)
 
-    errors = np.linalg.norm(settled - expected, axis=2) / np.linalg.norm(expected, axis=2)
+    differences = np.linalg.norm(settled - expected, axis=2)
+    errors = differences / np.linalg.norm(expected, axis=2)
     np.testing.assert_allclose(errors, 0, atol=6e-3, err_msg="by frequency and exciter")
 
 
@@ -329,11 +359,13 @@ def test_envelopes_lead_to_the_settled_vibration() -> None:
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     at_finger = plate.reduced.at(np.array([[FINGER.x, FINGER.y]]))[0]
 
+    levels = weights * [era.full_level for era in rig.eras]
+    at_points = plate.reduced.at(POINTS)
     responses = enveloped_accelerations(
         plate,
-        weights * [era.full_level for era in rig.eras],
+        levels,
         90.0,
-        points=plate.reduced.at(POINTS),
+        points=at_points,
         fingers=[(at_finger, FINGER.fingertip)],
         envelope=np.hanning(60),
         step=0.002,
@@ -353,8 +385,9 @@ def test_lowest_modes_are_those_of_a_board_and_magnets_by_hand() -> None:
     rig = stiff_board(exciter_rig(keys))
     board, magnets, foam = rig.plate.mass, 4 * 0.10929, 4 * 2000.0
     spring = magnets * (2 * math.pi * 27.2) ** 2
+    quadratic, constant = board * magnets, spring * foam
     linear = -(spring * (board + magnets) + foam * magnets)
-    squares = np.roots([board * magnets, linear, spring * foam])
+    squares = np.roots([quadratic, linear, constant])
     heaves = np.sqrt(squares.real) / (2 * math.pi)
 
     reduced = plate_with(rig).reduced
@@ -386,9 +419,11 @@ def test_onsets_and_endings_of_the_kernel_equal_those_of_numpy(rig, without_kern
     strokes = np.array([era.stroke for era in eras])
 
     def contrast_and_residual(quiet_count, level, rng):
-        target, *quiet = map(tuple, size * rng.uniform(0.1, 0.9, (1 + quiet_count, 2)))
+        shares = rng.uniform(0.1, 0.9, (1 + quiet_count, 2))
+        target, *quiet = map(tuple, size * shares)
         weights = rng.standard_normal((len(eras), 2)) @ [1, 1j]
-        phasors = strokes * weights * level / np.abs(weights).max()
+        weights *= level / np.abs(weights).max()
+        phasors = strokes * weights
         tones = {}
         for era, phasor in zip(eras, phasors.tolist(), strict=True):
             tones[era.name] = Tone.from_phasor(130.0, phasor)

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from era_haptics.drive import as_points, playable_layers
-from era_haptics.lab.design import problem
 from kit.plates import make_paper_rig
 from model.answer.answer import Layer
 from model.cli import app
@@ -47,24 +46,6 @@ def test_calibrate_finds_the_values_of_the_example() -> None:
     assert row["before"] == 17000.0
     assert row["after"] == stiffness
     assert row["unit"] == "N/m"
-
-
-def test_design_ranks_layouts_by_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two finalists by contrast, then the others by score, unsupported ones last."""
-    monkeypatch.setattr(problem, "JUDGED_SETS", 3)
-    monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
-
-    design = era.design(make_paper_rig(12, 9), layouts="random:8", finalists=2)
-
-    assert len(design.layouts) == 8
-    first, second, *others = design.layouts
-    assert first.contrast >= second.contrast
-    assert {layout.contrast for layout in others} == {None}
-    scores = [layout.score for layout in others if layout.score is not None]
-    assert scores == sorted(scores, reverse=True)
-    assert {len(layout.eras) for layout in design.layouts} == {4}
-    best = f"{first.name}, 4 ERAs, {first.contrast:.1f} dB"
-    assert repr(design) == f"<Design of 8 layouts: {best}>"
 
 
 @pytest.mark.parametrize(

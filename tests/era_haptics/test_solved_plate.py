@@ -62,7 +62,8 @@ def test_responses_weighted_by_a_drive_are_its_map(seed: int | None) -> None:
     drive = {"SW": 110, "NE": era.Drive(110, 0.5, 90), "SE": era.Drive(250, 0.2)}
     weights = np.array([[1, 0, 0.5j, 0], [0, 0.2, 0, 0]])  # SW, SE, NE, NW
 
-    plate_field = era.SolvedPlate(rig, seed=seed).map(drive, raster=(5, 4))
+    plate = era.SolvedPlate(rig, seed=seed)
+    plate_field = plate.map(drive, raster=(5, 4))
     columns, rows = np.meshgrid(plate_field.x, plate_field.y)
     points = np.column_stack([columns.ravel(), rows.ravel()])
     responses = era.SolvedPlate(rig).responses(points, [110, 250], seed=seed)
@@ -126,8 +127,10 @@ def test_play_of_a_signal_is_felt_as_the_same_drive(seed: int | None) -> None:
     without_harmonics = replace(RIG.uncertainty, harmonic=0.0)  # signals have none
     plate = era.SolvedPlate(replace(RIG, uncertainty=without_harmonics), seed=seed)
     sample = np.arange(COUNT)
-    ramp = (1 - np.cos(np.pi * np.minimum(sample / 400, 1))) / 2
-    tone = np.sin(2 * np.pi * 333.3 * sample / RATE + np.radians(20))
+    rise = np.minimum(sample / 400, 1)
+    ramp = (1 - np.cos(np.pi * rise)) / 2
+    angle = 2 * np.pi * 333.3 * sample / RATE
+    tone = np.sin(angle + np.radians(20))
     signals = np.zeros((4, COUNT))
     signals[2] = 0.7 * ramp * tone  # NE
     drive = {"NE": era.Drive(333.3, level=0.7, phase_deg=20)}
@@ -135,14 +138,14 @@ def test_play_of_a_signal_is_felt_as_the_same_drive(seed: int | None) -> None:
     of_signal = plate.play(signals, TARGET, quiet=QUIET, sample_rate=RATE)
     of_drive = plate.play(drive, TARGET, quiet=QUIET, duration=COUNT / RATE)
 
-    fingers = zip(
-        (*of_signal.targets, *of_signal.quiet), (*of_drive.targets, *of_drive.quiet), strict=True
-    )
-    for signal_record, drive_record in fingers:
-        expected = drive_record.accelerations[: COUNT - 1]
+    signal_records = (*of_signal.targets, *of_signal.quiet)
+    drive_records = (*of_drive.targets, *of_drive.quiet)
+    for signal_record, drive_record in zip(signal_records, drive_records, strict=True):
+        accelerations = drive_record.accelerations
+        expected = accelerations[: COUNT - 1]
         np.testing.assert_allclose(signal_record.times[1:], drive_record.times[: COUNT - 1])
-        differences = np.abs(signal_record.accelerations[1:] - expected).max(axis=1)
-        relative = differences / np.abs(drive_record.accelerations).max()
+        differences = np.abs(signal_record.accelerations[1:] - expected)
+        relative = differences.max(axis=1) / np.abs(accelerations).max()
         assert relative.max() < 2e-2
         if seed is None:
             assert relative[:-500].max() < 1e-4
@@ -160,8 +163,9 @@ def peak_at(plate: era.SolvedPlate, point: tuple[float, float]) -> float:
     """Return the steady peak acceleration at a point, from a playback."""
     drive = {"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90)}
     (felt,) = plate.play(drive, point).targets
-    nearest = np.argmin(np.linalg.norm(felt.points - point, axis=1))
-    return float(np.abs(felt.accelerations[-2000:, nearest]).max())
+    distances = np.linalg.norm(felt.points - point, axis=1)
+    steady = felt.accelerations[-2000:, distances.argmin()]
+    return float(np.abs(steady).max())
 
 
 def test_solved_plate_with_a_seed_is_one_drawn_plate() -> None:
@@ -184,11 +188,13 @@ def test_solved_plate_with_a_seed_is_one_drawn_plate() -> None:
 
 def test_solved_plate_without_tolerances_is_equal_for_all_seeds() -> None:
     """Only its mesh differs."""
-    known = replace(RIG, uncertainty=era.Uncertainty.none())
+    rig = replace(RIG, uncertainty=era.Uncertainty.none())
     drive = {"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90)}
+    nominal_plate = era.SolvedPlate(rig)
+    drawn_plate = era.SolvedPlate(rig, seed=3)
 
-    nominal = era.SolvedPlate(known).play(drive, TARGET)
-    drawn = era.SolvedPlate(known, seed=3).play(drive, TARGET)
+    nominal = nominal_plate.play(drive, TARGET)
+    drawn = drawn_plate.play(drive, TARGET)
 
     assert drawn.level_db_sl == pytest.approx(nominal.level_db_sl, abs=0.05)
 
@@ -196,15 +202,15 @@ def test_solved_plate_without_tolerances_is_equal_for_all_seeds() -> None:
 # Refusals
 
 
-NOT_A_NUMBER = np.full((4, 300), np.nan)
+SILENCE = np.zeros((4, 300))
 REFUSED_SIGNALS = {
-    "three ERAs": (np.zeros((3, 300)), 3000, r"SW, SE, NE, NW, got shape \(3, 300\)"),
-    "complex": (np.zeros((4, 300)) + 0j, 3000, "real numbers"),
-    "not a number": (NOT_A_NUMBER, 3000, "-1 to 1, got nan of SW at sample 0"),
+    "three ERAs": (SILENCE[:3], 3000, r"SW, SE, NE, NW, got shape \(3, 300\)"),
+    "complex": (SILENCE + 0j, 3000, "real numbers"),
+    "not a number": (SILENCE + np.nan, 3000, "-1 to 1, got nan of SW at sample 0"),
     "too large": (np.eye(4, 300) * 1.00000001, 3000, "got 1.00000001 of SW at sample 0"),
-    "low rate": (np.zeros((4, 300)), 1000, "above 1000 Hz"),
-    "no rate": (np.zeros((4, 300)), None, "sample_rate"),
-    "short": (np.zeros((4, 30)), 6000, "last from 0.01 to 10 s, got 0.005"),
+    "low rate": (SILENCE, 1000, "above 1000 Hz"),
+    "no rate": (SILENCE, None, "sample_rate"),
+    "short": (SILENCE[:, :30], 6000, "last from 0.01 to 10 s, got 0.005"),
     "drive": ({"SW": 110}, 3000, "got a dict"),
 }
 

@@ -14,8 +14,6 @@ from model.answer.stimulus import Placement
 from model.arrays import NEARLY, Complex64Array, FloatArray, Point
 from model.drive_forms import Forms, WeightedTones
 from model.drive_modes import playable_drive_modes
-from model.finger import fingertip_points
-from model.rig.rig import Uncertainty
 
 FREQUENCY_COUNT, ERA_COUNT, POINT_COUNT = 5, 3, 3
 SIGMA = 0.1
@@ -72,26 +70,6 @@ HIGHEST_LEVELS = {
     "phased": phased_weights.max_sensation,
 }
 """Of a mode, the highest ratio of amplitude to threshold."""
-
-
-def test_loudest_point_of_a_quiet_fingertip_counts() -> None:
-    """For a rig without tolerances, instead of the mean of a few points."""
-    (places,) = contact_sets(1, fingers=3, seed=8)
-    table = replace(smooth_table(), uncertainty=Uncertainty.none())
-    forms = forms_of(table, Placement((places[0],), tuple(places[1:])))
-    weights = complex_normal(np.random.default_rng(0), 27, 4)
-
-    power = forms.quiet_power(weights)
-
-    for row, finger in ((3, 0), (20, 1)):
-        drive = weights[row]
-        mean = (drive.conj() @ forms.quiet[row, finger] @ drive).real
-        points = fingertip_points(*places[1 + finger], table.plate)
-        fields = smooth_table().unit_fields(points, contacts=places)[row]
-        loudest = np.abs(drive @ fields).max() ** 2
-        at_few_points = np.linalg.norm(forms.few[row, finger] @ drive) ** 2
-        expected = mean + loudest - at_few_points
-        assert power[row, finger] == pytest.approx(expected, rel=2e-3), row
 
 
 def switched_scores(forms: Forms, wanted: float) -> list[float]:

@@ -1,9 +1,7 @@
-"""Figures of the paper, pictures of tables, and templates in real size.
-
-Templates have their lengths on paper, are mirrored for the underside, and need no fonts.
-"""
+"""Figures of the paper, pictures of tables, and full-scale templates."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,156 +12,203 @@ from tables import stiffness_study, tables
 
 from era_haptics.command import run_era
 from kit.plates import make_paper_rig, small_table, with_strokes, write_rig
+from model.arrays import FloatArray
 from model.figures.answers import answer_figure
 from model.figures.table_pictures import levels_figure
-from model.rig.rig_file import load_rig
+from model.rig.rig import Rig
+
+# Templates
 
 POINT = 25.4 / 72  # mm
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Path:
+def rig_path(tmp_path: Path) -> str:
     """The paper's plate with a foot of 6 mm radius under SW, 30 mm and 20 mm from its corner."""
-    return write_rig(tmp_path / "rig.yaml", ("at: [0, 0]", "at: [30 mm, 20 mm], foot: 6 mm"))
+    change = ("at: [0, 0]", "at: [30 mm, 20 mm], foot: 6 mm")
+    return str(write_rig(tmp_path / "rig.yaml", change))
 
 
-def box(drawing: ElementTree.Element, name: str) -> np.ndarray:
-    """Least and greatest x and y [mm] on paper of what has a name, from the top left."""
-    (group,) = [each for each in drawing.iter(f"{SVG}g") if each.get("id") == name]
+def box_of(drawing: ElementTree.Element, name: str) -> FloatArray:
+    """Return the lowest and highest x and y [mm] on paper of a group, from the top left."""
+    (group,) = [group for group in drawing.iter(f"{SVG}g") if group.get("id") == name]
     numbers = re.findall(r"[-\d.]+", group.find(f"{SVG}path").get("d"))
     ends = np.array(numbers, dtype=float).reshape(-1, 2) * POINT
     return np.array([ends.min(axis=0), ends.max(axis=0)])
 
 
 @pytest.mark.parametrize("side", ["below", "above"])
-def test_a_sheet_has_the_lengths_of_the_board(rig: Path, tmp_path: Path, side: str) -> None:
-    """Board 304.8 x 228.6 mm, ruler 100 mm, a circle of 12 mm at its place; x runs left below.
+def test_template_has_the_lengths_of_the_board(rig_path: str, tmp_path: Path, side: str) -> None:
+    """Board 304.8 x 228.6 mm, ruler 100 mm, a circle of 12 mm at its place; x runs left below."""
+    path = tmp_path / "template.svg"
 
-    It needs no font, since letters are outlines, and is the same bytes again: neither a date nor
-    random names; another circle is another file.
-    """
-    paths = [tmp_path / f"{name}.svg" for name in ("one", "two")]
-    for path in paths:
-        assert run_era(["plate", "template", str(rig), "--side", side, "-o", str(path)]) == 0
-    one, two = (path.read_bytes() for path in paths)
-    assert one == two
-    assert b"<text" not in one
-    assert b"font" not in one
-    drawing = ElementTree.parse(paths[0]).getroot()
-    assert drawing.get("width").endswith("pt")
-    shown = [float(drawing.get(key).removesuffix("pt")) for key in ("width", "height")]
-    assert shown == pytest.approx([float(each) for each in drawing.get("viewBox").split()[2:]])
-    board = box(drawing, "board")
+    assert run_era(["plate", "template", rig_path, "--side", side, "-o", str(path)]) == 0
+
+    drawing = ElementTree.parse(path).getroot()
+    size = [drawing.get("width"), drawing.get("height")]
+    *_, width, height = drawing.get("viewBox").split()
+    assert size == [f"{width}pt", f"{height}pt"]
+    board = box_of(drawing, "board")
     assert np.ptp(board, axis=0) == pytest.approx([304.8, 228.6], abs=0.01)
-    assert np.ptp(box(drawing, "ruler"), axis=0) == pytest.approx([100, 0], abs=0.01)
-    circle = box(drawing, "SW")
+    assert np.ptp(box_of(drawing, "ruler"), axis=0) == pytest.approx([100, 0], abs=0.01)
+    circle = box_of(drawing, "SW")
     assert np.ptp(circle, axis=0) == pytest.approx([12, 12], abs=0.1)
-    x = board[1, 0] - 30 if side == "below" else board[0, 0] + 30
-    assert circle.mean(axis=0) == pytest.approx([x, board[1, 1] - 20], abs=0.1)
+    (west, _), (east, bottom) = board
+    x = east - 30 if side == "below" else west + 30
+    assert circle.mean(axis=0) == pytest.approx([x, bottom - 20], abs=0.1)
 
 
-def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig: Path, tmp_path: Path, capsys) -> None:
-    """A board of 305 x 229 mm takes two pages upright, by hand; sensors are counted as places.
+def test_template_is_the_same_bytes_again(rig_path: str, tmp_path: Path) -> None:
+    """Without a date or random names; it needs no font, since letters are outlines."""
+    contents = []
+    for name in ("first.svg", "second.svg"):
+        assert run_era(["plate", "template", rig_path, "-o", str(tmp_path / name)]) == 0
+        contents.append((tmp_path / name).read_bytes())
 
-    One off the board is refused by its line, with meters for the millimeters that were meant.
-    """
+    first, second = contents
+    assert first == second
+    assert b"<text" not in first
+    assert b"font" not in first
+
+
+def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig_path: str, tmp_path: Path) -> None:
+    """By hand, a board of 305 x 229 mm takes two upright pages."""
+    path = tmp_path / "template.pdf"
+
+    assert run_era(["plate", "template", rig_path, "-o", str(path)]) == 0
+
+    pages = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", path.read_bytes())
+    sizes = np.array(pages, dtype=float) * POINT
+    np.testing.assert_allclose(sizes, [[210, 297], [210, 297]], atol=0.04)
+
+
+def test_sensor_off_the_board_is_refused_by_its_line(
+    rig_path: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With meters for the millimeters that were meant."""
     sensors, path = tmp_path / "sensors.csv", tmp_path / "template.pdf"
     sensors.write_text("sensor,x_m,y_m\nP1,47,41\n", "utf-8")
-    arguments = ["plate", "template", str(rig), "--sensors", str(sensors), "-o", str(path)]
-    assert run_era(arguments) == 2
+    options = ["--sensors", str(sensors), "-o", str(path)]
+
+    assert run_era(["plate", "template", rig_path, *options]) == 2
+
     assert re.search(r"sensors\.csv:2: sensor P1 .* 0\.047,0\.041", capsys.readouterr().err)
     assert not path.exists()
     sensors.write_text("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\n", "utf-8")
-    assert run_era(arguments) == 0
-    pages = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", path.read_bytes())
-    sizes = np.array(pages, dtype=float) * POINT  # mm
-    np.testing.assert_allclose(sizes, [[210, 297]] * 2, atol=0.04)
-    assert len(load_rig(rig).eras) == 4
+    assert run_era(["plate", "template", rig_path, *options]) == 0
+
+
+# The paper
 
 
 @pytest.fixture(scope="module")
-def figures() -> dict[str, PaperFigure]:
-    """All figures of the paper's rig, on a mesh that is near converged."""
-    return {made.name: made for made in paper_figures(make_paper_rig(48, 36), "all")}
+def paper_rig() -> Rig:
+    """The paper's rig, on a mesh that is near converged."""
+    return make_paper_rig(48, 36)
 
 
-def peaks(figure: PaperFigure) -> dict[str, np.ndarray]:
-    """The maps of a figure as its CSV file has them, by column."""
-    return {
-        name: np.asarray(column)
-        for name, column in figure.tables[""].items()
-        if name.startswith("peak_")
-    }
+@pytest.fixture(scope="module")
+def figures(paper_rig: Rig) -> dict[str, PaperFigure]:
+    """All figures of the paper's rig."""
+    return {figure.name: figure for figure in paper_figures(paper_rig, "all")}
 
 
-def test_tables_1_and_2_are_those_that_the_paper_prints() -> None:
-    """Every digit on its mesh; polynomials within 0.5 % of COMSOL, Eq. 29 as printed."""
-    made = dict(tables(make_paper_rig(48, 36)))
-    for name, columns in made.items():
-        # Half up, as the paper rounds: 110.945 is 110.95.
-        assert (np.floor(100 * columns["12x9"] + 0.5) / 100).tolist() == columns["paper"].tolist()
-        np.testing.assert_allclose(columns["model"], columns["COMSOL"], rtol=0.005, err_msg=name)
-    assert made["Table 1"]["paper"].tolist() == [110.95, 234.16, 337.90, 454.29, 459.69]
-    assert made["Table 2"]["paper"].tolist() == [31.98, 68.50, 76.62, 107.84, 160.77]
-    np.testing.assert_allclose(
-        made["Table 1"]["Eq. 29"], [109.70, 228.17, 320.31, 425.62, 438.79], atol=0.006
-    )
+def peaks_of(figure: PaperFigure) -> dict[str, FloatArray]:
+    """Return the maps of a figure as its CSV file has them, by column."""
+    columns = figure.tables[""].items()
+    return {name: np.asarray(column) for name, column in columns if name.startswith("peak_")}
 
 
-def test_figure_12_patterns_together_leave_few_nulls(figures):
-    """Section 3.3: together the six leave under 5 % of the plate below 30 % of their maxima."""
-    maps = peaks(figures["figure_12"])
+@pytest.fixture(scope="module")
+def paper_tables(paper_rig: Rig) -> dict[str, Mapping[str, FloatArray]]:
+    """The tables of the paper's rig, by column."""
+    return dict(tables(paper_rig))
+
+
+@pytest.mark.parametrize(
+    ("name", "frequencies"),
+    [
+        ("Table 1", [110.95, 234.16, 337.90, 454.29, 459.69]),
+        ("Table 2", [31.98, 68.50, 76.62, 107.84, 160.77]),
+    ],
+)
+def test_tables_are_those_of_the_paper(paper_rig: Rig, name: str, frequencies: list[float]) -> None:
+    """Every digit on its mesh, rounded half up as 110.945; polynomials within 0.5 % of COMSOL."""
+    columns = paper_tables[name]
+
+    assert columns["paper"].tolist() == frequencies
+    rounded = np.floor(100 * columns["12x9"] + 0.5) / 100
+    assert rounded.tolist() == frequencies
+    np.testing.assert_allclose(columns["model"], columns["COMSOL"], rtol=0.005)
+
+
+def test_equation_29_gives_the_frequencies_of_the_paper(
+    paper_tables: dict[str, Mapping[str, FloatArray]],
+) -> None:
+    """To the digits printed."""
+    frequencies = paper_tables["Table 1"]["Eq. 29"]
+
+    np.testing.assert_allclose(frequencies, [109.70, 228.17, 320.31, 425.62, 438.79], atol=0.006)
+
+
+def test_patterns_of_figure_12_leave_few_nulls(figures: dict[str, PaperFigure]) -> None:
+    """Section 3.3: together the six leave under 5 % of the plate below 30 % of their maxima.
+
+    Alone each leaves several times as much.
+    """
+    maps = peaks_of(figures["figure_12"])
+
+    is_still = {name: peak < 0.3 * peak.max() for name, peak in maps.items()}
     assert len(maps) == 6
-    still = np.all([peak < 0.3 * peak.max() for peak in maps.values()], axis=0)
-    assert 0 < still.mean() < 0.05
-    # Alone each leaves several times as much.
-    assert all((peak < 0.3 * peak.max()).mean() > 0.2 for peak in maps.values())
-    # 300 and 100 Hz exchanged between opposite corners: the same map, rotated.
-    there, back = maps["peak_300_100_hz_m_s2"], maps["peak_100_300_hz_m_s2"]
-    np.testing.assert_allclose(there, back[::-1], rtol=1e-5, atol=1e-5 * there.max())
+    assert 0 < np.all([*is_still.values()], axis=0).mean() < 0.05
+    for name, cells in is_still.items():
+        assert cells.mean() > 0.2, name
+    # 300 and 100 Hz exchanged between opposite corners: the same map, rotated
+    peak = maps["peak_300_100_hz_m_s2"]
+    rotated = maps["peak_100_300_hz_m_s2"][::-1]
+    np.testing.assert_allclose(peak, rotated, rtol=1e-5, atol=1e-5 * peak.max())
 
 
-def test_figure_13_doubled_stiffness_scales_the_map(figures):
+def test_doubled_stiffness_scales_the_map_of_figure_13(
+    figures: dict[str, PaperFigure], paper_rig: Rig
+) -> None:
     """Section 3.3, 250 Hz, 8 to 16 kN/m: 1.5 to 1.8 times the maximum, correlation above 0.98.
 
-    At these the study's maxima are those of the two maps, at 17 kN/m it is the map.
+    The study has the maxima of the two maps at these; at 17 kN/m its correlation is highest.
     """
-    soft, stiff = peaks(figures["figure_13_maps"]).values()
+    soft, stiff = peaks_of(figures["figure_13_maps"]).values()
     assert 1.5 < stiff.max() / soft.max() < 1.8
     assert np.corrcoef(soft, stiff)[0, 1] > 0.98
-    study = stiffness_study(make_paper_rig(48, 36))
+
+    study = stiffness_study(paper_rig)
+
     stiffness, maximum = study["stiffness / kN/m"], study["maximum / g"]
-    rows = [int(np.abs(stiffness - value).argmin()) for value in (8.0, 16.0)]
-    assert stiffness[rows] == pytest.approx([8.0, 16.0])
-    assert maximum[rows] == pytest.approx([soft.max() / 9.8, stiff.max() / 9.8])
-    assert stiffness[study["correlation"].argmax()] == pytest.approx(17, rel=0.1)
-    assert study["correlation"].max() <= 1 + 1e-12
+    for value, peak in ((8.0, soft), (16.0, stiff)):
+        row = np.abs(stiffness - value).argmin()
+        assert stiffness[row] == pytest.approx(value)
+        assert maximum[row] == pytest.approx(peak.max() / 9.8)
+    correlation = study["correlation"]
+    assert stiffness[correlation.argmax()] == pytest.approx(17, rel=0.1)
+    assert correlation.max() <= 1 + 1e-12
 
 
-def crossed(axes):
-    """Where cells are crossed out, along x."""
-    (crosses,) = (line for line in axes.lines if line.get_marker() == "x")
-    return [*crosses.get_xdata()]
+# Pictures of tables
 
 
-def test_figures_of_a_table_show_each_cell_and_an_answer():
-    """The first row of colours is the lowest y, and no cell of this plate is crossed out.
-
-    The field at the target's center is near the level asked for, 20 dB SL; three fingers. ERAs that
-    move a nanometer have a picture of words.
-    """
+def test_figure_of_levels_has_each_cell() -> None:
+    """The first row of colors is the lowest y, and no cell of this plate is crossed out."""
     table = small_table()
-    axes = levels_figure(table).axes[0]
-    (mesh,) = axes.collections
-    shown = mesh.get_array().reshape(3, 4)
-    np.testing.assert_array_equal(shown, table.available_level_db_sl.reshape(3, 4))
-    assert crossed(axes) == []
 
-    axes = answer_figure(table).axes[0]
-    levels = axes.collections[0].get_array()
-    rows, columns = levels.shape
-    at_target = levels[round(0.35 * (rows - 1)), round(0.3 * (columns - 1))]
-    assert at_target == pytest.approx(20.0, abs=2.0)
-    assert len(axes.patches) == 3
-    assert answer_figure(with_strokes(table, 1e-5)).axes == []
+    axes = levels_figure(table).axes[0]
+
+    (mesh,) = axes.collections
+    levels = mesh.get_array().reshape(3, 4)
+    np.testing.assert_array_equal(levels, table.available_level_db_sl.reshape(3, 4))
+    (crosses,) = [line for line in axes.lines if line.get_marker() == "x"]
+    assert len(crosses.get_xdata()) == 0
+
+
+def test_figure_of_no_answer_has_only_words() -> None:
+    """For ERAs that move a nanometer."""
+    assert answer_figure(with_strokes(small_table(), 1e-5)).axes == []

@@ -24,7 +24,7 @@ from model.answer.tone_search import choose_by_numpy, choose_tones, worst_ratios
 from model.arrays import Point
 from model.ensemble.draws import ClockErrors
 from model.errors import InputError
-from model.finger import THRESHOLDS, Grid, detection_threshold, fingertip_points, fingertip_weights
+from model.finger import THRESHOLDS, Grid, detection_threshold
 from model.rig.rig import Uncertainty
 from model.structure.attachments import PointLoad
 from model.table.table import LocalizationTable
@@ -426,28 +426,21 @@ def test_limit_is_not_lowered_for_another_content() -> None:
     assert joint.fingers[0].promised_level_db_sl > level_alone - 3.0
 
 
-def test_query_reaches_the_level_at_both_targets() -> None:
-    """Both at the level or above, the weaker one as predicted.
+def test_two_targets_share_a_vibration_of_their_level() -> None:
+    """The weaker one is promised the level.
 
     No phase is absolute: that of the strongest ERA is zero, the others are relative to it.
     """
-    table = smooth_table()
     ((*targets, quiet),) = contact_sets(1, fingers=3, seed=9)
+    placed = Placement(tuple(targets), (quiet,))
 
-    answer = query(table, Placement(tuple(targets), (quiet,)), 15.0, drive_mode="phased")
+    answer = query(smooth_table(), placed, 15.0, drive_mode="phased")
 
-    (layer,) = answer.layers
-    sensations = answer.fingers[:2]
-    for target, sensation in zip(targets, sensations, strict=True):
-        points = fingertip_points(*target, table.plate)
-        contacts = (*targets, quiet)
-        frequencies, amplitudes = table.amplitudes(layer.excitation, points, contacts=contacts)
-        sensed = np.linalg.norm(amplitudes.T / detection_threshold(frequencies), axis=1)
-        level = 20 * math.log10(sensed @ fingertip_weights(*target, table.plate))
-        assert sensation.level_db_sl == pytest.approx(level, abs=0.01), target
-    promised = min(sensation.promised_level_db_sl for sensation in sensations)
+    first, second, _ = answer.fingers
+    promised = min(first.promised_level_db_sl, second.promised_level_db_sl)
     assert promised == pytest.approx(15.0, abs=0.1)
-    assert sensations[1].verdict == "shared"
+    assert second.verdict == "shared"
+    (layer,) = answer.layers
     tones = sorted(layer.excitation.values(), key=lambda tone: tone.amplitude)
     assert tones[-1].phase == 0.0
     assert 0.0 not in {tone.phase for tone in tones[:-1]}

@@ -21,7 +21,6 @@ from model.answer.stimulus import Finger, Stimulus
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.ensemble.attached_plate import MODELED, PlateOnEras, attach, thickness_nodes
 from model.ensemble.draws import (
-    PROMISED_DRAWS,
     ClockErrors,
     Drawing,
     delayed,
@@ -231,18 +230,6 @@ def test_eras_of_one_amplifier_are_late_together() -> None:
     np.testing.assert_array_equal(gains[1], gains[3])
     assert np.abs(gains[0] - gains[1]).min() > 0
     np.testing.assert_array_equal(gains[4:], 0)
-
-
-def test_delays_change_no_magnitude() -> None:
-    """Gains of the plates of a promise differ by factors of magnitude 1."""
-    deviations = {**EXACT_DRIVES, "gain": 0.05, "phase": 0.1, "thicknesses": 40}
-    count, seed = PROMISED_DRAWS.count, PROMISED_DRAWS.seed
-    exact = draw(4, 1, masses=0, count=count, seed=seed, **deviations).gains
-    omega = 2 * math.pi * np.array([100.0, 200.0])
-
-    gains = delayed(exact, clocks(a=1e-4, b=1e-4), PROMISED_DRAWS, omega)
-
-    np.testing.assert_allclose(np.abs(1 + gains[1]), np.abs(1 + exact), rtol=1e-5)
 
 
 def random_weights(rows: int) -> Complex64Array:

@@ -20,7 +20,7 @@ from model.rig.rig import Rig
 from model.structure.fingertips import FingertipLoad
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.study.exact_plates import Plates, felt_on
+from model.study.exact_plates import draw_plates, felt_on
 from model.switched_patterns import highest_levels
 from model.table.fingertip_shapes import read_fingertips
 from model.table.raster import Raster
@@ -209,8 +209,8 @@ def test_frequency_that_a_table_lacks_is_refused(
     table: LocalizationTable, frequency: float
 ) -> None:
     """Between two of its own and beyond them, for the table's plate and for drawn ones."""
-    sizes = (1, 1, 1, (1, 4), (1, 1), (1, 4), (1, 1), 1, (1, 4, 2), (1, 4), (1, 0))
-    plates = Plates(*(np.ones(size) for size in sizes))
+    rng = np.random.default_rng(0)
+    plates = draw_plates(rng, table.uncertainty, of=table, count=1, contact_count=1)
     tones = {"SW": Tone(frequency, 1e-6, 0.0)}
 
     with pytest.raises(InputError):

@@ -75,21 +75,6 @@ def test_page_has_the_facts_of_docstrings(fact: str) -> None:
     assert fact.casefold() in text
 
 
-def test_page_lists_every_exception_with_its_base() -> None:
-    """A row `NAME` (a `BASE`) for each exported exception."""
-    rows = re.findall(r"^\| `(\w+)`(?: \(an? `(\w+)`\))? \|", PAGE, re.MULTILINE)
-
-    classes = {name: getattr(era, name) for name in era.__all__}
-    exceptions = set()
-    for name, exported in classes.items():
-        if isinstance(exported, type) and issubclass(exported, Exception):
-            exceptions.add(name)
-    assert {name for name, _ in rows} == exceptions
-    for name, base in rows:
-        bases = {ancestor.__name__ for ancestor in classes[name].__mro__}
-        assert base in {"", *bases}, name
-
-
 def test_page_documents_every_name() -> None:
     """Exactly the exported names, exceptions in their table."""
     documented = named(PAGE)

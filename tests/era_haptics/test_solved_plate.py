@@ -239,12 +239,6 @@ def test_responses_refuse_an_argument(arguments: dict[str, object], message: str
         PLATE.responses(**arguments)  # type: ignore[arg-type]
 
 
-def test_map_refuses_a_frequency_beyond_the_limits() -> None:
-    """The message names the key of the limit."""
-    with pytest.raises(era.InputError, match=r"500 Hz.*limits\.frequency"):
-        PLATE.map({"SW": 501})
-
-
 @pytest.mark.parametrize("seed", [-1, 0.5, "1", math.inf])
 def test_solved_plate_refuses_a_seed(seed: object) -> None:
     """A seed is a natural number."""

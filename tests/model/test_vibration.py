@@ -25,7 +25,6 @@ from model.finger import (
     check_has_threshold,
     detection_threshold,
     felt_part,
-    highest_measured,
     sensation_level,
     sensitivities,
 )
@@ -307,12 +306,6 @@ def test_pressing_fingertips_are_more_sensitive() -> None:
     assert max(pacinian) <= 35
 
 
-def test_sets_of_thresholds_are_measured_up_to_different_frequencies() -> None:
-    """The probe up to 500 Hz, pressing fingertips up to 315 Hz."""
-    assert highest_measured(PROBE) == 500.0
-    assert highest_measured(PRESSING) == 315.0
-
-
 def test_unknown_set_of_thresholds_is_refused() -> None:
     """By the names of the known sets."""
     with pytest.raises(InputError, match=PRESSING):
@@ -357,14 +350,6 @@ def test_frequencies_without_data_are_refused(frequency: float) -> None:
         sensation_level(frequencies, np.ones(2))
     with pytest.raises(InputError, match="10 to 1000 Hz"):
         sensitivities(frequencies, THRESHOLDS)
-
-
-def test_sensitivities_are_ratios_of_thresholds() -> None:
-    """At 250 Hz the probe's thresholds are 0.247 m/s² and those of pressing fingers 28 dB lower."""
-    probe, pressing = sensitivities(np.array([40.0, 250.0]), (PROBE, PRESSING), PROBE)
-
-    assert probe == pytest.approx(1)
-    assert pressing == pytest.approx([0.251 / 0.0919, 0.247 / 0.0098], rel=0.02)
 
 
 @pytest.mark.parametrize("rate", [8000.0, 44_100.0])

@@ -302,16 +302,6 @@ def test_louder_content_does_not_starve_a_softer_one() -> None:
     assert max(shares_of_stroke(served, table).values()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_two_contents_that_must_be_lowered_end_at_one_level() -> None:
-    """Levels of 57 and 54 dB SL, out of reach together."""
-    fingers = [wants(NEAR, level_db_sl=57), wants(FAR, level_db_sl=54)]
-
-    levels = promised_levels(phased(smooth_table(), fingers, min_contrast_db=-99))
-
-    assert levels[0] == pytest.approx(levels[1], abs=1e-3)
-    assert levels[0] < 53.5
-
-
 def test_twenty_fingers_take_little_memory(without_kernels: Callable[[], None]) -> None:
     """In numpy, whose arrays are counted: less than a table, though the level is out of reach."""
     without_kernels()

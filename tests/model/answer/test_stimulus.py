@@ -24,7 +24,7 @@ from model.answer.tone_search import choose_by_numpy, choose_tones, worst_ratios
 from model.arrays import Point
 from model.ensemble.draws import ClockErrors
 from model.errors import InputError
-from model.finger import THRESHOLDS, Grid, detection_threshold
+from model.finger import THRESHOLDS, detection_threshold
 from model.rig.rig import Uncertainty
 from model.structure.attachments import PointLoad
 from model.table.table import LocalizationTable
@@ -458,17 +458,6 @@ def test_band_limits_the_frequencies_of_an_answer(mode: str) -> None:
     for name, tone in banded.excitation.items():
         assert 150 <= tone.frequency <= 250, name
     assert at_end.frequency == end
-
-
-@pytest.mark.parametrize("cells", [(1, 1), (6, 4), (30, 20)])
-def test_grid_of_summaries_does_not_change_an_answer(cells: tuple[int, int]) -> None:
-    """A lone finger feels the same whatever the grid is."""
-    table = smooth_table()
-    placed = Placement((TARGET,))
-
-    answer = only(replace(table, grid=Grid(*cells)), placed, drive_mode="phased")
-
-    assert answer[0] == only(table, placed, drive_mode="phased")[0]
 
 
 @pytest.mark.parametrize(

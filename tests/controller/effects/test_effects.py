@@ -1,11 +1,8 @@
 """Effects at a finger, regions, and priorities among several fingers."""
 
 import math
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from itertools import pairwise
-from types import EllipsisType
 
 import pytest
 from hypothesis import given
@@ -16,38 +13,23 @@ from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimu
 from controller.effects.kinds import Buzz, Click, Detents, Ramp, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.play.intent import HapticIntent
 from controller.sources.touch import Contact, ContactKey
 from model.config.fields import Circle, Polygon, Rectangle
 
+LEFT = Rectangle(0.0, 0.0, 0.1, 0.2)
+RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)
+CLICK = {"click": Click(duration=0.04)}
+
 
 def finger(id: int, x: float = 0.05, y: float = 0.05, *, since: float = 0.0) -> Contact:
-    """A contact of a source."""
+    """A contact of a panel."""
     return Contact(ContactKey("panel", id), x, y, since)
 
 
-LEFT = Rectangle(0.0, 0.0, 0.1, 0.2)
-RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)
-
-
-@dataclass(frozen=True)
-class At:
-    """What fingers feel at a time [s]: levels [dB SL] by their ids.
-
-    played: an effect that is requested by name before, and its finger; level: the requested one.
-    until: when the intent expires, infinite for never, if it is looked at. starts: whether what is
-    short starts to play. layouts: how often the layout is replaced by itself before. says: what
-    is found in the reason for what is not felt.
-    """
-
-    now: float
-    felt: Mapping[int, float | None]
-    fingers: Sequence[Contact]
-    played: tuple[str, Contact] | None = None
-    level: float | None = None
-    until: float | EllipsisType = ...
-    starts: bool = True
-    layouts: int = 0
-    says: str = ""
+ON_LEFT = finger(1, 0.05)
+ON_RIGHT = finger(2, 0.15)
+ALSO_ON_RIGHT = finger(3, 0.16)
 
 
 def left(**effects: str) -> Region:
@@ -60,232 +42,253 @@ def right(on_press: str, *, priority: int = 0) -> Region:
     return Region("right", RIGHT, on_press=on_press, priority=priority)
 
 
-ONE, TWO, THREE = finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)
-AGAIN = finger(1, since=1.98)
-CLICK = {"click": Click(duration=0.04)}
-ALERT: dict[str, Effect] = {"buzz": Buzz(), "alert": Click(duration=0.1)}
-PRESSED = SurfaceLayout(effects={"click": Click(), "hum": Buzz(level=9.0)}, elsewhere="click")
-DOTS: dict[str, Effect] = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
-CLICKS_AND_DOTS = SurfaceLayout((left(on_press="click", on_move="dots"),), DOTS)
+def layout_of(
+    *regions: Region, effects: Mapping[str, Effect], elsewhere: str | None = None
+) -> SurfaceLayout:
+    """A layout of these regions and effects."""
+    return SurfaceLayout(regions, dict(effects), elsewhere)
 
 
-def new_layout(times: int) -> list[At]:
-    """Fingers that are down when the layout is replaced, and some that come later."""
-    return [
-        At(0.0, {1: 20.0, 2: 10.0}, [ONE, TWO]),
-        At(0.01, {1: 20.0, 2: 10.0}, [ONE, TWO], layouts=times),
-        At(0.9, {2: 24.0}, [ONE, TWO], ("buzz", TWO), 24.0),
-        At(1.0, {2: 24.0}, [ONE, TWO], layouts=times),
-        At(1.1, {1: 20.0, 2: 24.0}, [finger(1, 0.056), TWO]),
-        At(2.0, {}, []),
-        At(3.0, {1: 20.0}, [ONE]),
-        At(4.0, {1: 20.0}, [finger(1, 0.05, since=3.5)], layouts=1),  # not asked between
+class Surface:
+    """An effect player, and fingers on its layout."""
+
+    def __init__(self, layout: SurfaceLayout) -> None:
+        self.layout = layout
+        self.player = EffectPlayer(layout)
+        self.intent = HapticIntent(())
+        """The last intent."""
+
+    def feel(
+        self, now: float, *fingers: Contact, starts_pulses: bool = True
+    ) -> dict[int, float | None]:
+        """The levels [dB SL] that fingers feel, by their ids; pulses start to play now."""
+        self.intent = self.player.intent(fingers, now)
+        for target in self.intent.targets:
+            if starts_pulses and target.pulse is not None and target.pulse.started_at is None:
+                target.pulse.started_at = now
+        return {target.key.id: target.level_db_sl for target in self.intent.targets}
+
+    def must_feel(self, now: float, expected: dict[int, float], *fingers: Contact) -> None:
+        """Require the levels that fingers feel."""
+        assert self.feel(now, *fingers) == expected
+
+    def play(
+        self, effect: str, contact: Contact, now: float, *, level: float | None = None
+    ) -> None:
+        """Request an effect at a finger."""
+        self.player.play(effect, contact, now, level_db_sl=level)
+
+    def replace(self, *, times: int) -> None:
+        """Replace the layout by itself."""
+        for _ in range(times):
+            self.player.replace(self.layout)
+
+
+def test_click_ends_after_its_duration() -> None:
+    """It lasts 40 ms from its start, or 100 ms from its request without a start.
+
+    Then the intent expires, and the reason names the click.
+    """
+    effects = {"click": Click(level=18.0)}
+    surface = Surface(layout_of(effects=effects, elsewhere="click"))
+    assert surface.feel(10.0, ON_LEFT, starts_pulses=False) == {1: 18.0}
+    assert surface.intent.until == pytest.approx(10.1)
+    surface.must_feel(10.05, {1: 18.0}, ON_LEFT)
+    surface.must_feel(10.089, {1: 18.0}, ON_LEFT)
+    assert surface.intent.until == pytest.approx(10.09)
+    surface.must_feel(10.0901, {}, ON_LEFT)
+    assert surface.intent.until == math.inf
+    assert "click" in surface.intent.reason
+
+
+@pytest.mark.parametrize(("requested", "level"), [(None, 20.0), ("hum", 9.0)])
+def test_finger_that_returns_with_the_same_id_is_new(requested: str | None, level: float) -> None:
+    """It is known by when it came down, and feels its press or what is requested."""
+    effects = {"click": Click(), "hum": Buzz(level=9.0)}
+    surface = Surface(layout_of(effects=effects, elsewhere="click"))
+    surface.must_feel(0.0, {1: 20.0}, ON_LEFT)
+    surface.must_feel(1.0, {}, ON_LEFT)
+    returned = finger(1, since=1.98)
+    if requested:
+        surface.play(requested, returned, 2.0)
+    surface.must_feel(2.0, {1: level}, returned)
+
+
+def test_buzz_lasts_while_the_finger_stays() -> None:
+    """A new finger starts it again."""
+    surface = Surface(SurfaceLayout())
+    surface.must_feel(0.0, {1: 20.0}, ON_LEFT)
+    surface.must_feel(100.0, {1: 20.0}, ON_LEFT)
+    assert surface.intent.until == math.inf
+    surface.must_feel(101.0, {})
+    surface.must_feel(102.0, {1: 20.0}, ON_LEFT)
+
+
+def test_finger_on_an_edge_keeps_its_region() -> None:
+    """Half a millimeter of noise is no crossing; a millimeter is."""
+    effects = {"tick": Click(level=10.0), "tock": Click(level=15.0)}
+    surface = Surface(layout_of(left(on_press="tick"), right("tock"), effects=effects))
+    surface.must_feel(0.0, {1: 10.0}, finger(1, 0.0999))
+    for number in range(1, 20):
+        noise = 0.0005 * (number % 2)
+        surface.must_feel(0.1 * number, {}, finger(1, 0.0999 + noise))
+    surface.must_feel(2.0, {1: 15.0}, finger(1, 0.1009))
+    for number in range(1, 20):
+        noise = 0.0009 * (number % 2)
+        surface.must_feel(2.0 + 0.1 * number, {}, finger(1, 0.1009 - noise))
+
+
+def test_finger_that_slides_feels_presses_and_releases_of_regions() -> None:
+    """It is pressed where it comes in and released where it goes out; a lift is not felt."""
+    effects = {"soft": Click(level=10.0), "hard": Click(level=24.0), "buzz": Buzz(level=16.0)}
+    surface = Surface(
+        layout_of(left(on_press="soft", on_release="hard"), right("buzz"), effects=effects)
+    )
+    surface.must_feel(0.0, {1: 10.0}, finger(1, 0.05))
+    surface.must_feel(0.1, {}, finger(1, 0.06))
+    surface.must_feel(0.2, {1: 24.0}, finger(1, 0.15))  # the left region's release, on the right
+    surface.must_feel(0.3, {1: 16.0}, finger(1, 0.15))
+    surface.must_feel(0.4, {}, finger(1, 0.25))
+    surface.must_feel(0.5, {})
+
+
+def test_newest_finger_outside_of_all_regions_feels_the_effect_there() -> None:
+    """When it lifts, the one before does; fingers in a region feel theirs meanwhile."""
+    effects = {"buzz": Buzz(), "click": Click(level=12.0)}
+    surface = Surface(layout_of(right("click", priority=1), effects=effects, elsewhere="buzz"))
+    first, second = finger(1, 0.02), finger(2, 0.08)
+    surface.must_feel(0.0, {1: 20.0}, first)
+    surface.must_feel(0.1, {2: 20.0}, first, second)
+    surface.must_feel(0.2, {2: 20.0, 3: 12.0}, first, second, ALSO_ON_RIGHT)
+    surface.must_feel(0.3, {1: 20.0}, first, ALSO_ON_RIGHT)
+
+
+def test_intent_expires_at_the_first_end_of_a_pulse() -> None:
+    """A detent of 30 ms ends first, then the wait and the end of a neighbor's click of 40 ms."""
+    effects = {"dots": Detents(duration=0.03), **CLICK}
+    surface = Surface(layout_of(left(on_move="dots"), effects=effects, elsewhere="click"))
+    surface.feel(0.0, ON_LEFT)
+    moved = finger(1, 0.056)
+    surface.must_feel(1.0, {1: 20.0}, moved, ON_RIGHT)
+    surface.feel(1.001, moved, ON_RIGHT)
+    assert surface.intent.until == pytest.approx(1.03)
+    surface.must_feel(1.03, {}, moved, ON_RIGHT)
+    assert surface.intent.until == pytest.approx(1.06)
+    surface.must_feel(1.0601, {2: 20.0}, moved, ON_RIGHT)
+    surface.feel(1.07, moved, ON_RIGHT)
+    assert surface.intent.until == pytest.approx(1.1001)
+
+
+def test_clicks_of_fingers_are_60_ms_apart() -> None:
+    """The second and the third wait, and play for their whole duration."""
+    surface = Surface(layout_of(left(on_press="click"), right("click"), effects=CLICK))
+    fingers = ON_LEFT, ON_RIGHT, ALSO_ON_RIGHT
+    surface.must_feel(1.0, {1: 20.0}, *fingers)
+    surface.must_feel(1.059, {}, *fingers)
+    surface.must_feel(1.0601, {2: 20.0}, *fingers)
+    surface.must_feel(1.0999, {2: 20.0}, *fingers)
+    surface.must_feel(1.1201, {3: 20.0}, *fingers)
+    surface.must_feel(1.1602, {}, *fingers)
+
+
+def test_waiting_click_is_replaced_in_its_place() -> None:
+    """The second is requested at 10 and 15 ms and plays once, at 60; the first waits, but lifts."""
+    surface = Surface(layout_of(effects=CLICK))
+    fingers = ON_LEFT, ON_RIGHT, ALSO_ON_RIGHT
+    surface.play("click", ON_LEFT, 0.0)
+    surface.must_feel(0.0, {1: 20.0}, *fingers)
+    for now in (0.010, 0.015):
+        surface.play("click", ON_RIGHT, now)
+        surface.must_feel(now, {1: 20.0}, *fingers)
+    surface.must_feel(0.0601, {2: 20.0}, *fingers)
+    surface.play("click", ON_LEFT, 0.070)
+    surface.feel(0.070, *fingers)
+    surface.play("click", ALSO_ON_RIGHT, 0.080)
+    surface.must_feel(0.080, {2: 20.0}, ON_RIGHT, ALSO_ON_RIGHT)
+    surface.must_feel(0.1201, {3: 20.0}, ON_RIGHT, ALSO_ON_RIGHT)
+
+
+def test_run_without_a_stimulus_leaves_others_their_effects() -> None:
+    """A finger between detents of a region feels nothing."""
+    effects = {"dots": Detents(), "buzz": Buzz()}
+    surface = Surface(layout_of(left(on_move="dots"), effects=effects, elsewhere="buzz"))
+    outside = finger(1, 0.15)
+    surface.must_feel(0.0, {1: 20.0}, outside, finger(2, 0.05))
+    surface.must_feel(0.1, {1: 20.0, 2: 20.0}, outside, finger(2, 0.056))
+    surface.must_feel(0.2, {1: 20.0}, outside, finger(2, 0.056))
+
+
+def test_requested_effect_precedes_all_regions_until_it_ends() -> None:
+    """It has the requested level, also at a new finger, whose own effect continues afterwards."""
+    effects = {"buzz": Buzz(), "alert": Click(duration=0.1)}
+    surface = Surface(layout_of(effects=effects, elsewhere="buzz"))
+    surface.must_feel(0.0, {2: 20.0}, ON_LEFT, ON_RIGHT)
+    surface.play("alert", ON_LEFT, 0.05, level=24.0)
+    surface.must_feel(0.05, {1: 24.0, 2: 20.0}, ON_LEFT, ON_RIGHT)
+    surface.must_feel(0.16, {2: 20.0}, ON_LEFT, ON_RIGHT)
+
+    surface.play("alert", ALSO_ON_RIGHT, 1.0, level=12.0)
+    surface.must_feel(1.0, {3: 12.0}, ALSO_ON_RIGHT)
+    surface.must_feel(1.2, {3: 20.0}, ALSO_ON_RIGHT)
+
+
+def test_requested_effect_ends_with_its_finger() -> None:
+    """It continues through other regions, unlike the effect of a region."""
+    effects = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
+    surface = Surface(layout_of(left(on_press="hum"), Region("right", RIGHT), effects=effects))
+    surface.must_feel(0.0, {1: 9.0}, ON_LEFT)
+    surface.play("alert", ON_LEFT, 0.2)
+    surface.must_feel(0.2, {1: 18.0}, finger(1, 0.15))
+    surface.must_feel(3.0, {})
+    surface.must_feel(4.0, {1: 9.0}, finger(1, since=4.0))
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_new_layout_repeats_no_press(times: int) -> None:
+    """A finger that is down feels continuous effects and detents, but no second click.
+
+    A finger that comes later feels everything, also with the id of one that has lifted.
+    """
+    effects = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
+    layout = layout_of(left(on_press="click", on_move="dots"), effects=effects, elsewhere="buzz")
+    surface = Surface(layout)
+    surface.must_feel(0.0, {1: 20.0, 2: 10.0}, ON_LEFT, ON_RIGHT)
+    surface.replace(times=times)
+    surface.must_feel(0.01, {1: 20.0, 2: 10.0}, ON_LEFT, ON_RIGHT)
+    surface.play("buzz", ON_RIGHT, 0.9, level=24.0)
+    surface.must_feel(0.9, {2: 24.0}, ON_LEFT, ON_RIGHT)
+    surface.replace(times=times)
+    surface.must_feel(1.0, {2: 24.0}, ON_LEFT, ON_RIGHT)
+    surface.must_feel(1.1, {1: 20.0, 2: 24.0}, finger(1, 0.056), ON_RIGHT)
+    surface.must_feel(2.0, {})
+    surface.must_feel(3.0, {1: 20.0}, ON_LEFT)
+    surface.replace(times=1)
+    surface.must_feel(4.0, {1: 20.0}, finger(1, since=3.5))
+
+
+def test_press_outlasts_its_layout_near_an_older_finger() -> None:
+    """The newest finger outside of all regions stays the newest, though the older starts again."""
+    effects = {"press": Buzz(duration=1.0, level=12.0), "buzz": Buzz(level=9.0)}
+    surface = Surface(layout_of(effects=effects, elsewhere="press"))
+    newest = finger(2, since=0.5)
+    surface.feel(0.0, ON_LEFT)
+    surface.feel(0.5, ON_LEFT, newest)
+    surface.player.replace(layout_of(effects=effects, elsewhere="buzz"))
+    surface.must_feel(1.2, {2: 12.0}, ON_LEFT, newest)
+    surface.must_feel(1.6, {2: 9.0}, ON_LEFT, newest)
+
+
+def test_every_finger_in_a_region_feels_its_effect() -> None:
+    """Outside of all regions the newest alone; each with its level, priority and content."""
+    region = Region("left", LEFT, on_press="soft", on_move=None, priority=3)
+    effects = {"soft": Buzz(level=9.0), "buzz": Buzz()}
+    player = EffectPlayer(layout_of(region, effects=effects, elsewhere="buzz"))
+    fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16), finger(4, 0.06)]
+    targets = [
+        (target.key.id, target.level_db_sl, target.priority, target.content)
+        for target in player.intent(fingers, 0.0).targets
     ]
-
-
-SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
-    # 40 ms from its start; the intent expires then, or after 0.1 s without a start.
-    "a click ends after its duration": (
-        SurfaceLayout(effects={"click": Click(level=18.0)}, elsewhere="click"),
-        [
-            At(10.0, {1: 18.0}, [ONE], until=10.1, starts=False),
-            At(10.05, {1: 18.0}, [ONE]),
-            At(10.06, {1: 18.0}, [ONE], until=10.09),
-            At(10.089, {1: 18.0}, [ONE]),
-            At(10.0901, {}, [ONE]),
-            At(10.1, {}, [ONE], until=math.inf, says="click"),
-            At(10.2, {2: 18.0}, [finger(2)], says="^(?!.*click)"),
-        ],
-    ),
-    # With the same id, and no intent between: it is known by when it came down.
-    "a finger that came down again feels its press again": (
-        PRESSED,
-        [
-            At(0.0, {1: 20.0}, [finger(1)]),
-            At(1.0, {}, [finger(1)]),
-            At(2.0, {1: 20.0}, [AGAIN]),
-            At(3.0, {}, [AGAIN]),
-        ],
-    ),
-    "a finger that came down again feels what is requested": (
-        PRESSED,
-        [
-            At(0.0, {1: 20.0}, [finger(1)]),
-            At(1.0, {}, [finger(1)]),
-            At(2.0, {1: 9.0}, [AGAIN], ("hum", AGAIN)),
-            At(3.0, {1: 9.0}, [AGAIN]),
-        ],
-    ),
-    # Without a duration it goes on; a new finger starts it again.
-    "a buzz lasts while the finger stays": (
-        SurfaceLayout(),
-        [
-            At(0.0, {1: 20.0}, [ONE]),
-            At(100.0, {1: 20.0}, [ONE], until=math.inf),
-            At(101.0, {}, []),
-            At(102.0, {1: 20.0}, [ONE]),
-        ],
-    ),
-    # Half a millimeter across it is noise and no crossing; a millimeter of way is.
-    "a finger on an edge keeps its region": (
-        SurfaceLayout(
-            (left(on_press="tick"), right("tock")),
-            {"tick": Click(level=10.0), "tock": Click(level=15.0)},
-            elsewhere=None,
-        ),
-        [
-            At(0.0, {1: 10.0}, [finger(1, 0.0999)]),
-            *(At(0.1 * n, {}, [finger(1, 0.0999 + 0.0005 * (n % 2))]) for n in range(1, 20)),
-            At(2.0, {1: 15.0}, [finger(1, 0.1009)]),
-            *(At(2 + 0.1 * n, {}, [finger(1, 0.1009 - 0.0009 * (n % 2))]) for n in range(1, 20)),
-        ],
-    ),
-    # It presses where it comes in, is released where it goes out, and lifts without a feeling.
-    "a finger slides through regions": (
-        SurfaceLayout(
-            (left(on_press="soft", on_release="hard"), right("buzz")),
-            {"soft": Click(level=10.0), "hard": Click(level=24.0), "buzz": Buzz(level=16.0)},
-            elsewhere=None,
-        ),
-        [
-            At(0.0, {1: 10.0}, [finger(1, 0.05)]),
-            At(0.1, {}, [finger(1, 0.06)]),
-            At(0.2, {1: 24.0}, [finger(1, 0.15)]),  # left's release, on right
-            At(0.3, {1: 16.0}, [finger(1, 0.15)]),  # then right's own goes on
-            At(0.4, {}, [finger(1, 0.25)]),
-            At(0.5, {}, []),
-        ],
-    ),
-    # Then the one before, also beside a finger that feels the effect of a region.
-    "outside of all regions only the newest finger feels": (
-        SurfaceLayout((right("click", priority=1),), {"buzz": Buzz(), "click": Click(level=12.0)}),
-        [
-            At(0.0, {1: 20.0}, [finger(1, 0.02)]),
-            At(0.1, {2: 20.0}, [finger(1, 0.02), finger(2, 0.08)]),
-            At(0.2, {2: 20.0, 3: 12.0}, [finger(1, 0.02), finger(2, 0.08), THREE]),
-            At(0.25, {2: 20.0}, [finger(1, 0.02), finger(2, 0.08), THREE]),
-            At(0.3, {1: 20.0}, [finger(1, 0.02), THREE]),
-        ],
-    ),
-    # Of a detent of 30 ms, then the turn and the end of a click of 40 ms at another finger.
-    "an intent expires at the first end": (
-        SurfaceLayout(
-            (left(on_move="dots"),), {"dots": Detents(duration=0.03), **CLICK}, elsewhere="click"
-        ),
-        [
-            At(0.0, {}, [ONE]),
-            At(1.0, {1: 20.0}, [finger(1, 0.056), TWO]),
-            At(1.001, {1: 20.0}, [finger(1, 0.056), TWO], until=1.03),
-            At(1.03, {}, [finger(1, 0.056), TWO], until=1.06),
-            At(1.0601, {2: 20.0}, [finger(1, 0.056), TWO]),
-            At(1.07, {2: 20.0}, [finger(1, 0.056), TWO], until=1.1001),
-            At(1.1002, {}, [finger(1, 0.056), TWO], until=math.inf),
-        ],
-    ),
-    # The second and the third wait, and play for their whole duration.
-    "clicks of two fingers are 60 ms apart": (
-        SurfaceLayout((left(on_press="click"), right("click")), CLICK, elsewhere=None),
-        [
-            At(1.0, {1: 20.0}, [ONE, TWO, THREE]),
-            At(1.01, {1: 20.0}, [ONE, TWO, THREE], until=1.04),
-            At(1.059, {}, [ONE, TWO, THREE]),
-            At(1.0601, {2: 20.0}, [ONE, TWO, THREE]),
-            At(1.0999, {2: 20.0}, [ONE, TWO, THREE]),
-            At(1.1201, {3: 20.0}, [ONE, TWO, THREE]),
-            At(1.1602, {}, [ONE, TWO, THREE]),
-        ],
-    ),
-    # The first at 0 ms, the second at 10 and again at 15: once, at 60; the first waits again, but
-    # lifts: the third is next.
-    "a waiting click is replaced in its place": (
-        SurfaceLayout(effects=CLICK, elsewhere=None),
-        [
-            At(0.0, {1: 20.0}, [ONE, TWO, THREE], ("click", ONE)),
-            At(0.010, {1: 20.0}, [ONE, TWO, THREE], ("click", TWO)),
-            At(0.015, {1: 20.0}, [ONE, TWO, THREE], ("click", TWO)),
-            At(0.0601, {2: 20.0}, [ONE, TWO, THREE]),
-            At(0.070, {2: 20.0}, [ONE, TWO, THREE], ("click", ONE)),
-            At(0.080, {2: 20.0}, [TWO, THREE], ("click", THREE)),
-            At(0.1201, {3: 20.0}, [TWO, THREE]),
-        ],
-    ),
-    # A finger between detents of a region feels nothing, and leaves the others what they feel.
-    "plays without a stimulus count for nothing": (
-        SurfaceLayout((left(on_move="dots"),), {"dots": Detents(), "buzz": Buzz()}),
-        [
-            At(0.0, {1: 20.0}, [finger(1, 0.15), finger(2, 0.05)]),
-            At(0.1, {1: 20.0, 2: 20.0}, [finger(1, 0.15), finger(2, 0.056)]),
-            At(0.2, {1: 20.0}, [finger(1, 0.15), finger(2, 0.056)]),
-        ],
-    ),
-    # At its level, until it ends.
-    "what is requested comes before all regions": (
-        SurfaceLayout(effects=ALERT),
-        [
-            At(0.0, {2: 20.0}, [finger(1), finger(2)]),
-            At(0.05, {1: 24.0, 2: 20.0}, [finger(1), finger(2)], ("alert", finger(1)), 24.0),
-            At(0.16, {2: 20.0}, [finger(1), finger(2)]),
-        ],
-    ),
-    # What its place has for it begins all the same, and goes on when the other is over.
-    "what is requested plays for a finger that is new": (
-        SurfaceLayout(effects=ALERT),
-        [At(0.0, {1: 12.0}, [ONE], ("alert", ONE), 12.0), At(0.2, {1: 20.0}, [ONE])],
-    ),
-    # It goes on through other regions, unlike what a region has for it.
-    "what is requested ends with its finger": (
-        SurfaceLayout(
-            (left(on_press="hum"), Region("right", RIGHT)),
-            {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)},
-            elsewhere=None,
-        ),
-        [
-            At(0.0, {1: 9.0}, [finger(1, 0.05)]),
-            At(0.2, {1: 18.0}, [finger(1, 0.15)], ("alert", finger(1, 0.05))),
-            At(3.0, {}, []),
-            At(4.0, {1: 9.0}, [finger(1, 0.05, since=4.0)]),
-        ],
-    ),
-    # A finger that is down feels what lasts and what moves by it, but no second click. One that
-    # comes later feels all, also under the name of one that has lifted, be it unnoticed.
-    "a new layout repeats no press": (CLICKS_AND_DOTS, new_layout(1)),
-    "a layout that is replaced twice repeats no press": (CLICKS_AND_DOTS, new_layout(2)),
-}
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_fingers_feel_their_effects(name: str) -> None:
-    """At every time of a scenario, in whose name it is said."""
-    layout, steps = SCENARIOS[name]
-    player = EffectPlayer(layout)
-    for step in steps:
-        for _ in range(step.layouts):
-            player.replace(layout)
-        if step.played is not None:
-            player.play(*step.played, step.now, level_db_sl=step.level)
-        intent = player.intent(step.fingers, step.now)
-        assert {each.key.id: each.level_db_sl for each in intent.targets} == step.felt, step
-        if step.until is not ...:
-            assert intent.until == pytest.approx(step.until), step
-        assert re.search(step.says, intent.reason), step
-        for target in intent.targets if step.starts else ():
-            if target.pulse is not None and target.pulse.started_at is None:
-                target.pulse.started_at = step.now
-
-
-def test_a_press_outlasts_its_layout_beside_an_older_finger() -> None:
-    """The newest finger outside of all regions stays it, though the older one starts anew."""
-    effects: dict[str, Effect] = {"press": Buzz(duration=1.0), "buzz": Buzz()}
-    player = EffectPlayer(SurfaceLayout((), effects, "press"))
-    fingers = [ONE, finger(2, since=0.5)]
-    player.intent([ONE], 0.0)
-    player.intent(fingers, 0.5)
-    player.replace(SurfaceLayout((), effects, "buzz"))
-    felt = [player.intent(fingers, at).targets for at in (1.2, 1.6)]
-    assert [[(each.key.id, each.content) for each in one] for one in felt] == [
-        [(2, "press")],
-        [(2, "buzz")],
-    ]
+    assert targets == [(2, 9.0, 3, "soft"), (3, 20.0, 0, "buzz"), (4, 9.0, 3, "soft")]
 
 
 @pytest.mark.parametrize(
@@ -302,193 +305,216 @@ def test_a_press_outlasts_its_layout_beside_an_older_finger() -> None:
 def test_ramp_rises_in_steps(
     ramp: Ramp, level: float | None, step: float, levels: list[float | None]
 ) -> None:
-    """Over its duration; then it holds the last level, or as strong as the neighbors allow."""
-    course = ramp.start(finger(1), 5.0, level_db_sl=level)
-    felt = [course.feel(finger(1), 5.0 + step * number + 1e-9) for number in range(len(levels))]
-    assert [getattr(one, "level_db_sl", None) for one in felt] == levels
-    for one, number in zip(felt, range(1, len(levels)), strict=False):
-        until = getattr(one, "until", None)
-        assert until is None or until == pytest.approx(5.0 + step * number)
-    last = EffectStimulus(level) if ramp.hold else None
-    assert felt[-1] == last
+    """Afterwards it can hold the last level, or be as strong as its neighbors permit."""
+    run = ramp.start(ON_LEFT, 5.0, level_db_sl=level)
+    for number, expected in enumerate(levels):
+        stimulus = run.feel(ON_LEFT, 5.0 + step * number + 1e-9)
+        is_last = number == len(levels) - 1
+        if is_last:
+            assert stimulus == (EffectStimulus(level) if ramp.hold else None)
+            continue
+        assert isinstance(stimulus, EffectStimulus)
+        assert stimulus.level_db_sl == expected, f"step {number}"
+        if stimulus.until is not None:
+            assert stimulus.until == pytest.approx(5.0 + step * (number + 1))
 
 
-def test_texture_level_follows_speed() -> None:
-    """At `fast` the level, at the geometric mean of slow and fast half of the range less.
-
-    At rest nothing, 80 ms after the last report from another place.
-    """
-    texture = Texture(slow=0.01, fast=0.16, range=16.0)
-    for speed, level in ((0.16, 20.0), (0.5, 20.0), (0.04, 12.0), (0.0101, 4.0)):
-        course = texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
-        for step in range(1, 20):
-            felt = course.feel(finger(1, speed * 0.01 * step), 0.01 * step)
-        assert isinstance(felt, EffectStimulus)
-        assert felt.level_db_sl == level
-        assert 0.08 <= felt.until - 0.18 <= 0.0901
-        assert course.feel(finger(1, speed * 0.19), felt.until) == NoStimulus()
-    course = texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
+def slide(run: EffectRun, speed: float) -> tuple[object, float]:
+    """What a finger feels at last that slides for 0.19 s at a speed [m/s], and where it is [m]."""
+    stimulus = None
     for step in range(1, 20):
-        felt = course.feel(finger(1, 0.009 * 0.01 * step), 0.01 * step)
-    assert isinstance(felt, NoStimulus)
+        way = 0.01 * speed * step
+        stimulus = run.feel(finger(1, way), 0.01 * step)
+    return stimulus, way
+
+
+def texture_run(slow: float, fast: float, span: float) -> EffectRun:
+    """A texture of 20 dB SL at the speed `fast`, from the edge of the plate on."""
+    texture = Texture(slow=slow, fast=fast, range=span)
+    return texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "level"), [(0.16, 20.0), (0.5, 20.0), (0.04, 12.0), (0.0101, 4.0)]
+)
+def test_texture_level_follows_speed(speed: float, level: float) -> None:
+    """At the geometric mean of slow and fast, it is lower by half of the range.
+
+    At rest there is nothing, 80 ms after the last report from another position.
+    """
+    run = texture_run(0.01, 0.16, 16.0)
+    stimulus, way = slide(run, speed)
+    assert isinstance(stimulus, EffectStimulus)
+    assert stimulus.level_db_sl == level
+    assert stimulus.until is not None
+    assert 0.08 <= stimulus.until - 0.18 <= 0.0901
+    assert run.feel(finger(1, way), stimulus.until) == NoStimulus()
+
+
+def test_texture_is_not_felt_below_its_slow_speed() -> None:
+    """A tenth less than `slow` is no movement."""
+    stimulus, _ = slide(texture_run(0.01, 0.16, 16.0), 0.009)
+    assert isinstance(stimulus, NoStimulus)
 
 
 def test_texture_starts_with_the_movement() -> None:
-    """After a rest of seconds the first report elsewhere counts against the last 60 ms.
+    """After a rest of seconds, the first report elsewhere counts over the last 60 ms.
 
     3 mm within them are 5 cm/s, which is halfway between slow and fast along the logarithm.
     """
-    course = Texture(slow=0.01, fast=0.25, range=16.0).start(finger(1, 0.0), 0, level_db_sl=20)
-    course.feel(finger(1, 0.001), 0.01)
-    assert course.feel(finger(1, 0.001), 0.2) == NoStimulus()
-    felt = course.feel(finger(1, 0.004), 5.0)
-    assert isinstance(felt, EffectStimulus)
-    assert felt.level_db_sl == 12.0
+    run = texture_run(0.01, 0.25, 16.0)
+    run.feel(finger(1, 0.001), 0.01)
+    assert run.feel(finger(1, 0.001), 0.2) == NoStimulus()
+    stimulus = run.feel(finger(1, 0.004), 5.0)
+    assert isinstance(stimulus, EffectStimulus)
+    assert stimulus.level_db_sl == 12.0
 
 
 def test_texture_level_has_hysteresis() -> None:
-    """Speeds around the border of two levels, 1 dB from each, keep the one that was first."""
-    course = Texture(slow=0.01, fast=0.1, range=20.0).start(finger(1, 0), 0, level_db_sl=20)
-    levels, way = set(), 0.0
+    """Speeds 0.8 and 1.2 dB below `fast`, on both sides of a border at 1 dB, keep one level."""
+    run = texture_run(0.01, 0.1, 20.0)
+    levels = set()
+    way = 0.0
     for step in range(1, 60):
-        # By turns 0.8 dB and 1.2 dB below `fast`: on both sides of the border at 1 dB.
-        way += 0.01 * 0.1 * 10 ** -((0.8 if step // 10 % 2 else 1.2) / 20)
-        felt = course.feel(finger(1, way), 0.01 * step)
-        assert isinstance(felt, EffectStimulus)
-        levels.add(felt.level_db_sl)
+        attenuation = 0.8 if step // 10 % 2 else 1.2
+        way += 0.01 * 0.1 * 10 ** (-attenuation / 20)
+        stimulus = run.feel(finger(1, way), 0.01 * step)
+        assert isinstance(stimulus, EffectStimulus)
+        levels.add(stimulus.level_db_sl)
     assert len(levels) == 1
 
 
 def test_detents_click_once_per_detent() -> None:
-    """Detents lie at 5, 15, 25 mm from where the finger came down, 10 mm apart.
+    """Detents lie at 5, 15, 25 mm from where the finger came down.
 
     Noise around one is no second click, and the way back clicks again.
     """
-    course = Detents(spacing=0.010, along="y").start(finger(1, y=0.05), 0.0, level_db_sl=14.0)
+    run = Detents(spacing=0.010, along="y").start(finger(1, y=0.05), 0.0, level_db_sl=14.0)
     clicks = []
-    for index, way in enumerate((1, 4, 5.3, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
-        now = 0.1 * index
-        felt = course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now)
-        if isinstance(felt, EffectStimulus):
+    for number, way in enumerate((1, 4, 5.3, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
+        now = 0.1 * number
+        moved = finger(1, x=0.9, y=0.05 + 1e-3 * way)
+        stimulus = run.feel(moved, now)
+        if isinstance(stimulus, EffectStimulus):
             clicks.append(way)
-            felt.pulse.started_at = now
-            assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == NoStimulus()
+            assert stimulus.pulse is not None
+            stimulus.pulse.started_at = now
+            assert run.feel(moved, now + 0.031) == NoStimulus()
     assert clicks == [5.6, 15.6, 30.6, 24]
 
 
-def test_every_finger_in_a_region_feels_its_own() -> None:
-    """And outside of all regions the newest alone; each with its level, priority and content."""
-    region = Region("left", LEFT, on_press="soft", on_move=None, priority=3)
-    player = EffectPlayer(SurfaceLayout((region,), {"soft": Buzz(level=9.0), "buzz": Buzz()}))
-    fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16), finger(4, 0.06)]
-    targets = player.intent(fingers, 0.0).targets
-    assert [(each.key.id, each.level_db_sl, each.priority, each.content) for each in targets] == [
-        (2, 9.0, 3, "soft"),
-        (3, 20.0, 0, "buzz"),
-        (4, 9.0, 3, "soft"),
-    ]
-
-
 def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> None:
-    """Two fingers by turns, 50 a second each for 2 s: one click every 60 ms, each soon felt."""
-    player = EffectPlayer(SurfaceLayout(effects={"click": Click(duration=0.04)}, elsewhere=None))
-    fingers = [finger(1, 0.05), finger(2, 0.15)]
+    """Two fingers take turns, 50 requests per second each: one click every 60 to 70 ms."""
+    surface = Surface(layout_of(effects=CLICK))
+    fingers = [ON_LEFT, ON_RIGHT]
     starts: list[tuple[float, int]] = []
     for step in range(400):
         now = 0.005 * step
         if step % 2 == 0:
-            player.play("click", fingers[step // 2 % 2], now, level_db_sl=None)
-        for target in player.intent(fingers, now).targets:
-            if target.pulse.started_at is None:
-                target.pulse.started_at = now
+            surface.play("click", fingers[step // 2 % 2], now)
+        surface.feel(now, *fingers)
+        for target in surface.intent.targets:
+            assert target.pulse is not None
+            if target.pulse.started_at == now:
                 starts.append((now, target.key.id))
                 assert now - target.pulse.requested_at <= 0.125
-    assert [id for _, id in starts] == [1 + number % 2 for number in range(len(starts))]
-    pauses = [after - before for (before, _), (after, _) in pairwise(starts)]
-    assert all(0.06 - 1e-9 <= pause <= 0.07 for pause in pauses)
-    assert len(starts) >= 28  # 2 s by 70 ms
+
+    ids = [id for _, id in starts]
+    assert ids == [1 + number % 2 for number in range(len(ids))]
+    pauses = [later - sooner for (sooner, _), (later, _) in pairwise(starts)]
+    assert min(pauses) >= 0.06 - 1e-9
+    assert max(pauses) <= 0.07
 
 
-def test_requested_effect_restarts_when_requested_again() -> None:
-    """An effect without an end, requested a thousand times, runs once."""
-    felt: list[float] = []
+class Endless(Buzz, EffectRun):
+    """An effect that never ends, and records when it is felt."""
 
-    class Endless(Buzz, EffectRun):
-        """Never ends, and notes when it is felt."""
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Return itself."""
+        return self
 
-        def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-            return self
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Record the time."""
+        FELT_TIMES.append(now)
+        return EffectStimulus(20.0)
 
-        def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-            felt.append(now)
-            return EffectStimulus(20.0)
 
-    player = EffectPlayer(SurfaceLayout(effects={"hum": Endless()}, elsewhere=None))
+FELT_TIMES: list[float] = []
+"""When the endless effect was felt [s]."""
+
+
+def test_effect_that_is_requested_a_thousand_times_runs_once() -> None:
+    """It has no end."""
+    FELT_TIMES.clear()
+    surface = Surface(layout_of(effects={"hum": Endless()}))
     for number in range(1000):
-        player.play("hum", finger(1), 0.001 * number, level_db_sl=None)
-    player.intent([finger(1)], 2.0)
-    assert felt == [2.0]
+        surface.play("hum", ON_LEFT, 0.001 * number)
+    surface.feel(2.0, ON_LEFT)
+    assert FELT_TIMES == [2.0]
 
 
-def test_a_click_is_felt_beside_what_lasts_at_its_finger() -> None:
-    """6 dB above it where neither the layout nor who plays it gives a level; then alone again."""
-    effects: dict[str, Effect] = {"buzz": Buzz(level=14), "click": Click(), "soft": Click(level=15)}
-    player = EffectPlayer(SurfaceLayout((left(on_press="buzz"),), effects, elsewhere=None))
-    for now, name, asked, level, above in (
-        (0.0, "click", None, 20.0, 6.0),
-        (1.0, "click", 18.0, 18.0, None),
-        (2.0, "soft", None, 15.0, None),
-    ):
-        player.intent([ONE], now)
-        player.play(name, ONE, now, level_db_sl=asked)
-        lasting, short = player.intent([ONE], now).targets
-        assert (lasting.content, lasting.level_db_sl) == ("buzz", 14.0)
-        assert (short.content, short.level_db_sl, short.above_db) == (name, level, above)
-        assert player.intent([ONE], now + 0.2).targets == (lasting,)
-
-
-@given(
-    steps=st.lists(
-        st.tuples(
-            st.floats(0, 0.2),
-            st.dictionaries(
-                st.integers(0, 3),
-                st.tuples(st.floats(0, 0.2), st.floats(0, 0.2)),
-                max_size=4,
-            ),
-        ),
-        max_size=25,
-    )
+@pytest.mark.parametrize(
+    ("name", "requested", "level", "above"),
+    [("click", None, 20.0, 6.0), ("click", 18.0, 18.0, None), ("soft", None, 15.0, None)],
 )
-def test_player_invariants_for_any_movement(
-    steps: list[tuple[float, dict[int, tuple[float, float]]]],
+def test_click_is_felt_in_addition_to_the_buzz_of_its_finger(
+    name: str, requested: float | None, level: float, above: float | None
 ) -> None:
-    """Only fingers that are there are targets, each once, and no intent ran out before.
+    """6 dB above it if neither the layout nor the request states a level."""
+    effects = {"buzz": Buzz(level=14), "click": Click(), "soft": Click(level=15)}
+    player = EffectPlayer(layout_of(left(on_press="buzz"), effects=effects))
+    player.intent([ON_LEFT], 0.0)
+    player.play(name, ON_LEFT, 0.0, level_db_sl=requested)
+    buzz, click = player.intent([ON_LEFT], 0.0).targets
+    assert (buzz.content, buzz.level_db_sl) == ("buzz", 14.0)
+    assert (click.content, click.level_db_sl, click.above_db) == (name, level, above)
+    assert player.intent([ON_LEFT], 0.2).targets == (buzz,)
+
+
+POSITIONS = st.tuples(st.floats(0, 0.2), st.floats(0, 0.2))
+FINGERS = st.dictionaries(st.integers(0, 3), POSITIONS, max_size=4)
+MOVEMENTS = st.lists(st.tuples(st.floats(0, 0.2), FINGERS), max_size=25)
+
+
+@given(MOVEMENTS)
+def test_player_invariants_for_any_movement(
+    movement: list[tuple[float, dict[int, tuple[float, float]]]],
+) -> None:
+    """Only present fingers are targets, each once, and no intent has already expired.
 
     The same sequence gives the same intents.
     """
-    regions = (
+    layout = layout_of(
         Region("left", LEFT, on_press="click", on_move="texture", on_release="click"),
         Region("round", Circle(0.1, 0.1, 0.05), on_press="ramp", on_move="detents", priority=2),
+        effects={
+            "buzz": Buzz(),
+            "click": Click(),
+            "ramp": Ramp(),
+            "texture": Texture(),
+            "detents": Detents(),
+        },
+        elsewhere="buzz",
     )
-    effects: dict[str, Effect] = {
-        "buzz": Buzz(),
-        "click": Click(),
-        "ramp": Ramp(),
-        "texture": Texture(),
-        "detents": Detents(),
-    }
-    players = [EffectPlayer(SurfaceLayout(regions, effects)) for _ in range(2)]
+    player, second_player = EffectPlayer(layout), EffectPlayer(layout)
     now = 0.0
-    for pause, places in steps:
+    for pause, positions in movement:
         now += pause
-        contacts = [finger(id, x, y) for id, (x, y) in places.items()]
-        first, again = (player.intent(contacts, now) for player in players)
-        assert first == again
-        assert {target.key for target in first.targets} <= {each.key for each in contacts}
-        felt = {(target.key, target.is_short) for target in first.targets}
-        assert len(felt) == len(first.targets)
-        assert first.until > now
+        contacts = [finger(id, x, y) for id, (x, y) in positions.items()]
+        intent = player.intent(contacts, now)
+        assert second_player.intent(contacts, now) == intent
+        targets = [(target.key.id, target.is_short) for target in intent.targets]
+        assert {id for id, _ in targets} <= positions.keys()
+        assert len({*targets}) == len(targets)
+        assert intent.until > now
+
+
+L_SHAPE = Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)))
+"""Its inner corner is at (0.1, 0.1)."""
+OUTER_CORNERS = ((0, 0), (0.3, 0), (0.3, 0.2), (0.2, 0.2))
+INNER_CORNERS = ((0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2))
+U_SHAPE = Polygon((*OUTER_CORNERS, *INNER_CORNERS))
+"""Between its arms is outside, also on the line through their ends."""
 
 
 @pytest.mark.parametrize(
@@ -496,45 +522,33 @@ def test_player_invariants_for_any_movement(
     [
         (Rectangle(0.1, 0.2, 0.3, 0.1), [(0.1, 0.2), (0.4, 0.3), (0.2, 0.25)], [(0.41, 0.25)]),
         (Circle(0.1, 0.1, 0.05), [(0.15, 0.1), (0.13, 0.13)], [(0.14, 0.14)]),
-        (
-            # An L: its inner corner at (0.1, 0.1).
-            Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2))),
-            [(0.05, 0.15), (0.15, 0.05), (0.1, 0.15), (0, 0), (0.1, 0.1)],
-            [(0.15, 0.15), (0.101, 0.101), (-0.001, 0.1), (0.05, 0.2001)],
-        ),
-        (
-            # A U: between its arms is outside, also on the line through their ends.
-            Polygon(
-                (
-                    *((0, 0), (0.3, 0), (0.3, 0.2), (0.2, 0.2)),
-                    *((0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)),
-                )
-            ),
-            [(0.25, 0.2), (0.05, 0.05)],
-            [(0.15, 0.2), (0.15, 0.15)],
-        ),
+        (L_SHAPE, [(0.05, 0.15), (0.1, 0.15), (0.1, 0.1)], [(0.15, 0.15), (-0.001, 0.1)]),
+        (U_SHAPE, [(0.25, 0.2), (0.05, 0.05)], [(0.15, 0.2), (0.15, 0.15)]),
     ],
 )
-def test_shapes(
+def test_edges_and_corners_belong_to_a_shape(
     shape: Rectangle | Circle | Polygon,
     inside: list[tuple[float, float]],
     outside: list[tuple[float, float]],
 ) -> None:
-    """Edges and corners belong to a shape."""
-    assert [shape.contains(*point) for point in inside] == [True] * len(inside)
-    assert [shape.contains(*point) for point in outside] == [False] * len(outside)
+    """Points within and outside of each kind of shape."""
+    for point in inside:
+        assert shape.contains(*point), point
+    for point in outside:
+        assert not shape.contains(*point), point
 
 
-def test_effect_kinds_include_plug_ins() -> None:
-    """Their parameters are described as JSON."""
+class Rhythm(Buzz):
+    """Beats of one's own."""
 
-    class Rhythm(Buzz):
-        """Beats of one's own."""
+    beats: tuple[float, ...] = (0.1, 0.2)
+    count: int = 3
 
-        beats: tuple[float, ...] = (0.1, 0.2)
-        count: int = 3
 
-    listed = effects_result(SurfaceLayout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects
-    (_, rhythm) = (each.model_dump(mode="json") for each in listed)
+def test_listed_effects_describe_the_parameters_of_plug_ins() -> None:
+    """As JSON."""
+    effects = effects_result(layout_of(effects={"rhythm": Rhythm()})).effects
+    (rhythm,) = [effect.model_dump(mode="json") for effect in effects]
     assert rhythm["description"] == "Beats of one's own."
-    assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)
+    assert rhythm["parameters"]["beats"] == [0.1, 0.2]
+    assert rhythm["parameters"]["count"] == 3

@@ -1,6 +1,6 @@
-"""Errors as a user meets them: commands, files that are no such file, interruptions, a full disk.
+"""Errors as a user meets them: commands, invalid files, interruptions, a full disk.
 
-Each reader refuses what is wrong in words; hostile files are in test_hostile_files.py.
+Hostile files are in test_hostile_files.py.
 """
 
 import contextlib
@@ -19,9 +19,7 @@ from controller.sources.touch import open_source
 from drivers.errors import CommandError
 from drivers.wires.wire import address_of
 from era_haptics.command import run_era
-from era_haptics.lab.design.problem import (
-    area_of,
-)
+from era_haptics.lab.design.problem import area_of
 from kit.outside_files import READERS, RIG
 from model.commands.options import parse_frequencies
 from model.config.document import read_document
@@ -49,7 +47,7 @@ from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lin
 REMEDY = re.compile(
     r";|must|expected|did you mean|see |try|give|use|write|check|known|add|first|make|install", re.I
 )
-"""A message of the page says what is right, or what to do next, in one of these ways."""
+"""A message of the page states the rule, or the remedy, in one of these ways."""
 
 
 @pytest.fixture(scope="module")
@@ -68,19 +66,22 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     ],
 )
 def test_error_has_its_status_and_place(case: Case, shelf: Path, tmp_path: Path) -> None:
-    """A command that fails says where, in one paragraph, and writes nothing."""
+    """A command that fails states the location in one paragraph, and writes nothing."""
     outcome = provoke(case, tmp_path, shelf)
+    message = outcome.text.replace(", line ", ":")
     assert outcome.status == case.status
-    assert outcome.text.startswith("era: error: ")
-    for place in case.at:
+    assert message.startswith("era: error: ")
+    for location in case.at:
         # As a whole: line 1 is not in line 11, nor a key in one below it.
-        assert re.search(
-            rf"{re.escape(place)}((?<!\w)|(?!\w|\.\w))", outcome.text.replace(", line ", ":")
-        ), outcome.text
-    assert not INTERNALS.search(outcome.text)
-    assert len(outcome.text) < 1500
-    assert outcome.out == "" if not case.said else outcome.out.startswith(case.said)
-    assert not outcome.changed
+        whole = rf"{re.escape(location)}((?<!\w)|(?!\w|\.\w))"
+        assert re.search(whole, message), message
+    assert not INTERNALS.search(message)
+    assert len(message) < 1500
+    if case.said:
+        assert outcome.out.startswith(case.said)
+    else:
+        assert outcome.out == ""
+    assert outcome.changed == frozenset()
 
 
 SHOWN = {tuple(case.typed): case for case in cases() if case.shown}
@@ -89,7 +90,7 @@ QUOTED = quotations(PAGE.read_text("utf-8"))
 
 @pytest.mark.parametrize("quoted", QUOTED, ids=lambda quoted: quoted.typed[-1])
 def test_page_quotes_status_and_remedy(quoted: Quotation) -> None:
-    """A section has the errors of its exit status, and each message says what to do."""
+    """A section has the errors of its exit status, and each message has a remedy."""
     assert SHOWN[tuple(quoted.typed)].status == quoted.status
     assert REMEDY.search(quoted.text)
 
@@ -137,21 +138,25 @@ def home(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     rig = CASE_RIG.replace("[40, 300]", "[40, 500]").replace("mesh: 12x9", "mesh: auto")
     (tmp_path / "rig.yaml").write_text(rig, encoding="utf-8")
     (tmp_path / "table.npz").write_bytes((shelf / "table.npz").read_bytes())
-    head, *rows = (shelf / "measured.csv").read_text("utf-8").splitlines(keepends=True)
-    frequencies = list(dict.fromkeys(row.split(",")[6] for row in rows))[::4]
-    measured = head + "".join(row for row in rows if row.split(",")[6] in frequencies)
-    (tmp_path / "measured.csv").write_text(measured, encoding="utf-8")
+    measured = (shelf / "measured.csv").read_text("utf-8")
+    head, *rows = measured.splitlines(keepends=True)
+    frequencies = dict.fromkeys(row.split(",")[6] for row in rows)
+    few_frequencies = [*frequencies][::4]
+    few_rows = [row for row in rows if row.split(",")[6] in few_frequencies]
+    (tmp_path / "measured.csv").write_text(head + "".join(few_rows), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / ".cache"))
     return tmp_path
 
 
-def files(folder: Path) -> dict[str, bytes]:
+def files_of(folder: Path) -> dict[str, bytes]:
     """Files of a folder, without the cache."""
-    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {
-        name: path.read_bytes() for name, path in found.items() if not name.startswith(".cache/")
-    }
+    files = {}
+    for path in folder.rglob("*"):
+        name = str(path.relative_to(folder))
+        if path.is_file() and not name.startswith(".cache/"):
+            files[name] = path.read_bytes()
+    return files
 
 
 def outcome_of(command: str) -> tuple[int, str]:
@@ -173,15 +178,16 @@ def outcome_of(command: str) -> tuple[int, str]:
 def test_interrupted_commands_keep_previous_output(home: Path, commands: dict[str, str]) -> None:
     """The exit status is 130, without a traceback, and the files are unchanged."""
     for command in commands:
-        target = home / [*command.split("-o "), "-"][1].split()[0]
+        _, _, output = command.partition("-o ")
+        target = home / (output.split() or ["-"])[0]
         if target.suffix:
             target.write_bytes(b"")
-    before = files(home)
-    for status, said in interrupted(commands, home).values():
-        assert status == 130, said
-        assert "Traceback" not in said
-        assert "error" not in said
-    assert files(home) == before
+    former_files = files_of(home)
+    for status, message in interrupted(commands, home).values():
+        assert status == 130, message
+        assert "Traceback" not in message
+        assert "error" not in message
+    assert files_of(home) == former_files
 
 
 @pytest.mark.parametrize("command", shortly([*WRITING, "config init out.yaml"], QUICK))
@@ -189,76 +195,125 @@ def test_command_keeps_previous_output_when_the_disk_is_full(
     command: str, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It prints one line of error, and the files are unchanged."""
-    fit, fitted = calibrate.calibrate, []
+    results: list[object] = []
+    calibrate_rig = calibrate.calibrate
 
-    def fit_once(*arguments: Any, **keywords: Any) -> Any:
-        if not fitted:
-            fitted.append(fit(*arguments, **keywords))
-        return fitted[0]
+    def calibrate_once(*arguments: Any, **options: Any) -> object:
+        if not results:
+            results.append(calibrate_rig(*arguments, **options))
+        return results[0]
 
-    monkeypatch.setattr(calibrate, "calibrate", fit_once)
+    monkeypatch.setattr(calibrate, "calibrate", calibrate_once)
     if not command.startswith(("report", "config")):  # these replace nothing
-        status, said = outcome_of(command)
-        assert status == 0, said
-    before = files(home)
+        status, message = outcome_of(command)
+        assert status == 0, message
+    former_files = files_of(home)
     with full_disk():
-        status, said = outcome_of(command)
+        status, message = outcome_of(command)
     assert status == 2
     progress = re.compile(r"era: \d+ of \d+ ")
-    (line,) = (line for line in said.splitlines() if not progress.match(line))
-    assert line.startswith("era: error: "), said
-    assert files(home) == before
+    lines = [line for line in message.splitlines() if not progress.match(line)]
+    assert len(lines) == 1, message
+    assert lines[0].startswith("era: error: ")
+    assert files_of(home) == former_files
 
 
-TEN_METERS, URL = Plate(10.0, 10.0, 0.002, material("float-glass")), "sim://"
+TEN_METERS = Plate(10.0, 10.0, 0.002, material("float-glass"))
 
 
 def simulated(url: str, *wires: str) -> dict[str, SimulatedWire]:
     """The wire of the amplifier main at a URL, by options of `era sim`."""
-    usual = SimulatedWire("serial")
-    return assign_wires({"main": url}, common=None, options=wires, defaults=usual)
+    defaults = SimulatedWire("serial")
+    return assign_wires({"main": url}, common=None, options=wires, defaults=defaults)
+
+
+def read_scheduler(text: str) -> object:
+    """Compute 0 divmod 1 on a cluster."""
+    return [*on_cluster(text, divmod, 1, {0: 1})]
+
+
+def read_mesh(text: str) -> object:
+    """The mesh of the rig."""
+    return mesh_of(text, RIG.plate, frequency_max=500.0)
+
+
+def read_large_mesh(text: str) -> object:
+    """The mesh of a plate of ten meters."""
+    return mesh_of(text, TEN_METERS, frequency_max=500.0)
+
+
+def read_wires(text: str) -> object:
+    """The wires of options of `era sim`."""
+    return simulated("sim://", *text.split())
+
+
+def read_line(text: str) -> object:
+    """The line of an option of `era sim`."""
+    return choose_lines(simulated("serial:///dev/ttyUSB0"), [text])
+
+
+def read_area(text: str) -> object:
+    """The area of a design."""
+    return area_of(text, RIG.plate)
 
 
 PARSERS: dict[str, Callable[[str], object]] = {
     "amplifier URL": address_of,
     "touch URL": open_source,
     "frequencies": parse_frequencies,
-    "scheduler": lambda text: [*on_cluster(text, divmod, 1, {0: 1})],
+    "scheduler": read_scheduler,
     "material": material,
-    "mesh": lambda text: mesh_of(text, RIG.plate, frequency_max=500.0),
-    "mesh of ten metres": lambda text: mesh_of(text, TEN_METERS, frequency_max=500.0),
-    "wire": lambda text: simulated(URL, *text.split()),
+    "mesh": read_mesh,
+    "mesh of ten metres": read_large_mesh,
+    "wire": read_wires,
     "URL to simulate": simulated,
-    "line": lambda text: choose_lines(simulated("serial:///dev/ttyUSB0"), [text]),
-    "area": lambda text: area_of(text, RIG.plate),
+    "line": read_line,
+    "area": read_area,
 }
-"""By what a text is, what reads it."""
+"""What reads a text, by what it is."""
+FILE_READERS = {**READERS, "document.yaml": read_document}
+"""What reads a file, by its name; a document can hold any plain data."""
+
+
+def read_as(kind: str, path: Path, text: str) -> None:
+    """Read a file, or its text."""
+    if kind in FILE_READERS:
+        FILE_READERS[kind](path)
+    else:
+        PARSERS[kind](text)
+
+
+def repeated(text: str) -> str:
+    """A text in which `<5000 9>` stands for as many nines."""
+    return re.sub(r"<(\d+) (.+?)>", lambda match: int(match[1]) * match[2], text)
+
+
+REFUSED = read_yaml(Path(__file__).with_name("refused.yaml"))
 
 
 @pytest.mark.parametrize(
-    ("read", "named", "text", "pattern"),
+    ("read", "name", "text", "pattern"),
     [
-        (each["read"], each.get("named", each["read"]), text, pattern)
-        for each in read_yaml(Path(__file__).with_name("refused.yaml"))
-        for text, pattern in each["refused"].items()
+        (entry["read"], entry.get("named", entry["read"]), repeated(text), pattern)
+        for entry in REFUSED
+        for text, pattern in entry["refused"].items()
     ],
 )
-def test_what_is_wrong_is_said(
-    tmp_path: Path, read: str, named: str, text: str, pattern: str
+def test_invalid_text_is_refused(
+    tmp_path: Path, read: str, name: str, text: str, pattern: str
 ) -> None:
-    """Of a file with its name, line and key; nothing that a text asks for is opened."""
-    text = re.sub(r"<(\d+) (.+?)>", lambda found: int(found[1]) * found[2], text)
-    (tmp_path / named).write_text(text, "utf-8")
-    files = {**READERS, "document.yaml": read_document}  # which may hold any plain data
+    """The message has the file name, line and key; nothing that a text asks for is opened."""
+    path = tmp_path / name
+    path.write_text(text, "utf-8")
     with pytest.raises((InputError, CommandError), match=pattern):
-        files[read](tmp_path / named) if read in files else PARSERS[read](text)
+        read_as(read, path, text)
 
 
 @pytest.mark.parametrize(
     "shape", shortly([b"(True, 4)", b"(-1, -4)", b"(%s,)" % (b"9" * 5000), b"4"], [b"(-1, -4)"])
 )
 def test_array_without_a_shape_is_refused(tmp_path: Path, shape: bytes) -> None:
-    """Of .npy, whose header Python parses: True counts as 1, and two negative counts as a size."""
+    """Python parses the header of .npy: True counts as 1, and two negative counts as a size."""
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': %s}" % shape
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     member = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(32)

@@ -11,23 +11,23 @@ from processes.error_cases import INTERNALS
 from processes.hostile_files import MIB, VARIANTS, HostileReading, Report
 
 MAX_MEMORY = 64 * MIB
-"""Most memory of a reader above the size of the file [bytes]."""
+"""Memory of a reader above the size of the file [bytes]."""
 
 MAX_SECONDS = 5.0
-"""Most time of the processor for a hostile file of 8 MiB."""
+"""Processor time for a hostile file of 8 MiB [s]."""
 
 _IN_UTF_16 = {"UTF-16"}
 _BETWEEN_DATASETS = {"UTF-16", "surrogates as UTF-8"}
 
 READ: dict[str, set[str]] = {
-    # Strengths that were never set have no file.
+    # Strengths have no file until they are set.
     "strengths.json": {"missing", "UTF-16", "UTF-32"},
     "measured.csv": {"UTF-16", "cut in half"},
     "measured.uff": {*_BETWEEN_DATASETS, "zero bytes inside"},  # in a description
     "modes.uff": _BETWEEN_DATASETS,
     **dict.fromkeys(("places.csv", "sensors.csv", "moved.csv", "modes.csv"), _IN_UTF_16),
 }
-"""By the name of a file the variants that its reader may read."""
+"""The variants that the reader of a file can read."""
 
 
 READ_BY_LINES = {"token.txt", "questions.jsonl"}
@@ -43,7 +43,7 @@ SHORT = (
     "table.npz",
     "questions.jsonl",
 )
-"""Those of each format that `make test` takes."""
+"""Files of each format that `make test` takes."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def hostile() -> Iterator[HostileReading]:
 
 @pytest.mark.parametrize("name", READERS)
 def test_reader_reads_a_valid_file(name: str, tmp_path: Path) -> None:
-    """What hostile files are made of is valid, so that only their harm is refused."""
+    """Hostile files are made of valid ones, so that only their harm is refused."""
     READERS[name](write_sample(tmp_path, name))
 
 
@@ -66,15 +66,14 @@ def test_reader_refuses_hostile_files_within_bounds(
     """One message that names the file, within 64 MiB above its size and in time; no bug."""
     reports = [*hostile.reports(name, tmp_path)]
     assert len(reports) > 0.8 * len(VARIANTS)
-    assert {report.variant for report in reports if report.outcome == "read"} == READ.get(
-        name, set()
-    )
-    faults = {report.variant: fault for report in reports if (fault := _fault_of(report, name))}
-    assert not faults
+    variants = {report.variant for report in reports if report.outcome == "read"}
+    assert variants == READ.get(name, set())
+    faults = {report.variant: _fault_of(report, name) for report in reports}
+    assert {variant: fault for variant, fault in faults.items() if fault} == {}
 
 
 def _fault_of(report: Report, name: str) -> str:
-    """What is wrong with a report, "" if nothing is."""
+    """The fault of a report, or an empty text."""
     if report.outcome == "bug":
         return report.text
     if report.memory - report.size > MAX_MEMORY:
@@ -88,12 +87,12 @@ def _fault_of(report: Report, name: str) -> str:
 
 def _fault_of_message(report: Report, name: str) -> str:
     message = report.text
-    first, *others = message.splitlines()
+    first, *further = message.splitlines()
     if name == "questions.jsonl" and first.startswith("{"):
         return "" if '"line": ' in message else message  # the error of a line
     if name not in first:
         return f"does not name the file: {message}"
-    if others and not first.endswith(":"):  # problems of a file, or of one that it names, follow
+    if further and not first.endswith(":"):  # problems of a file, or of one that it names, follow
         return f"more than one message: {message}"
     if INTERNALS.search(message) or not first.isprintable():
         return f"words of Python, or control characters: {message}"

@@ -41,7 +41,7 @@ test: .venv/installed-test
 # The tests nearest to what differs from main: about a minute, stopping at the first failure.
 # Since another commit: make test-changed SINCE=HEAD~3
 test-changed: .venv/installed-test
-	$(BIN)/python tests/support/changed_tests.py $(if $(SINCE),--since $(SINCE))
+	$(BIN)/python tests/programs/changed_tests.py $(if $(SINCE),--since $(SINCE))
 
 # All that is long, one target after another, in at most three hours; the results are in
 # out/nightly/page.md. Others: make nightly NIGHTLY='soak kill-test', or NIGHTLY_OPTIONS=--report
@@ -69,7 +69,7 @@ test-busy: .venv/installed-test
 # The model's tests, the typed pages and the demonstration with the arithmetic of four kinds of
 # processor, and what differs between their answers; four minutes. Others: make test-kernels KERNELS=--answers
 test-kernels: .venv/installed-test
-	$(BIN)/python tests/support/kernels.py $(KERNELS)
+	$(BIN)/python tests/programs/kernels.py $(KERNELS)
 
 # What reads and writes Modbus, with the lowest and the newest pymodbus that the bounds allow, each in
 # a folder of its own. Others: make test-pymodbus PYMODBUS=3.12.1
@@ -96,10 +96,10 @@ lint: .venv/installed-test
 
 # Weight and density of the tree, for reviewers; nothing fails on them. One folder: make weigh WEIGH=controller
 weigh: .venv/installed-test
-	$(BIN)/python tests/support/weigh.py $(WEIGH)
+	$(BIN)/python tests/programs/weigh.py $(WEIGH)
 
 # Every page, part of a page, client stub and C header that is written from the code.
-PAGES := OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/support $(BIN)/python docs/generators/pages.py
+PAGES := OPENBLAS_NUM_THREADS=1 $(BIN)/python docs/generators/pages.py
 pages: .venv/installed-test
 	$(PAGES)
 
@@ -127,7 +127,7 @@ rename-test: .venv/installed-test
 # Two hundred daemons killed at random moments, over every wire, and when all was silent;
 # `make test` takes eight. Others: make kill-test KILLS='--kills 20 --seed 7'
 kill-test: .venv/installed-test
-	$(BIN)/python tests/support/kills.py $(KILLS)
+	$(BIN)/python tests/programs/kills.py $(KILLS)
 
 # Faults of the daemon, each by the real process, with the figures measured.
 fault-test: .venv/installed-test
@@ -143,7 +143,7 @@ stop-test: .venv/installed-test
 # Ten thousand taps while every frame is late by up to 16 ms, with one and three amplifiers on a line;
 # `make test` takes some. Others: make late-test LATE='--taps 100000'
 late-test: .venv/installed-test
-	$(BIN)/python tests/support/late_taps.py $(LATE)
+	$(BIN)/python tests/programs/late_taps.py $(LATE)
 
 # The Qt application of the examples with PySide6, without a screen.
 qt-test: .venv/installed-qt
@@ -152,12 +152,12 @@ qt-test: .venv/installed-qt
 # The whole chain in virtual time, by as many seeds as 20 minutes allow; `make test` takes seven.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
-	$(BIN)/python tests/support/soak.py $(SOAK)
+	$(BIN)/python tests/programs/soak.py $(SOAK)
 
 # True errors of responses in polynomials against their estimates, on 23 plates with 20 layouts;
 # some minutes. `make test` takes one plate with four.
 estimate-test: .venv/installed-test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/support/error_estimates.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/programs/error_estimates.py
 
 # A curved glass by the modes that CalculiX computes, against its whole equations; some minutes.
 # Others: make surface-test SURFACE='--sets 200'
@@ -199,11 +199,11 @@ dist: .venv/installed-release
 # The wheel alone, in a clean environment for each of python3.11 to python3.14 that is found.
 # Others: make smoke SMOKE='--python /path/to/python3.13'
 smoke: dist
-	$(BIN)/python tests/support/smoke.py dist/*.whl $(SMOKE)
+	$(BIN)/python tests/programs/smoke.py dist/*.whl $(SMOKE)
 
 # The same with the lowest version of every dependency that its bound allows.
 smoke-lowest: dist
-	$(BIN)/python tests/support/smoke.py dist/*.whl --python python3.11 --lowest $(SMOKE)
+	$(BIN)/python tests/programs/smoke.py dist/*.whl --python python3.11 --lowest $(SMOKE)
 
 # What comes with the wheel, as CycloneDX: dist/sbom.json of the plain installation, and
 # dist/sbom-extras.json with those extras that users install.
@@ -217,7 +217,7 @@ sbom: dist
 	done
 
 licences: sbom
-	$(BIN)/python tests/support/licences.py dist/sbom.json dist/sbom-extras.json > docs/reference/licences.md
+	$(BIN)/python tests/programs/licences.py dist/sbom.json dist/sbom-extras.json > docs/reference/licences.md
 
 clean:
 	rm -rf model/compiled/*.so sim/soft_amp/*.so

@@ -25,7 +25,7 @@ NUMERICS_VERSION = 23
 """Version of the numbers that the model computes; stored results of other versions are not used.
 
 Increase it with every change of figures beyond rounding. Then record the new figures with
-`python tests/support/reference_figures.py`.
+`python tests/programs/reference_figures.py`.
 """
 
 

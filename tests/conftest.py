@@ -28,8 +28,8 @@ from model.reduction import free_plate  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.rig.rig_file import example_rig_path, load_rig  # noqa: E402
 from model.table.table_file import cached_table  # noqa: E402
+from processes.installed import needs  # noqa: E402
 from processes.patient_daemon import allow_long_watchdogs, wait_long  # noqa: E402
-from processes.typed_page import needs  # noqa: E402
 from registry import threads  # noqa: E402
 
 # Forty examples of each property, a hundred without it, however long a busy machine takes.

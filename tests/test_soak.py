@@ -21,7 +21,7 @@ from soak_runs import (
     run_plan,
 )
 
-SOAK = Path(__file__).parent / "support" / "soak.py"
+SOAK = Path(__file__).parent / "programs" / "soak.py"
 
 
 def digests() -> dict[str, str]:

@@ -12,6 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "programs"))
+
 import changed_tests
 import client_stub
 import effects_page
@@ -116,7 +119,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
     "docs/reference/effects.md": _parts("effects_page.py", effects_page.PARTS),
     "docs/reference/urls.md": _urls("urls"),
     "docs/how-to/simulated-hardware.md": _urls("far_ends"),
-    "CONTRIBUTING.md": [part("tests/support/changed_tests.py", changed_tests.table)],
+    "CONTRIBUTING.md": [part("tests/programs/changed_tests.py", changed_tests.table)],
 }
 """Writers of each generated file, by path."""
 

@@ -19,7 +19,7 @@ _CORE = ("firmware/core", "firmware/wire")
 PROGRAMS: Mapping[tuple[str, ...], Sequence[str]] = {
     (*_CORE, "firmware/ports/posix", "firmware/test"): ["-std=c99"],
     (*_CORE, "firmware/ports/sound"): ["-std=c99", '-DCONFIG_FILE="sound_config.h"'],
-    ("examples/smallest_amplifier", "tests/support"): ["-std=c11", "-D_GNU_SOURCE"],
+    ("examples/smallest_amplifier", "tests/programs"): ["-std=c11", "-D_GNU_SOURCE"],
     ("model/compiled", "tests/model"): ["-std=gnu11", "-DLANES=4"],
 }
 """Folders whose files are compiled together, with the options of the compiler."""

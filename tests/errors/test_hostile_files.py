@@ -8,7 +8,7 @@ import pytest
 from cases import shortly
 from kit.outside_files import READERS, SAMPLES, write_sample
 from processes.error_cases import INTERNALS
-from processes.hostile_files import MIB, VARIANTS, HostileReading, Report
+from tests.errors.hostile_files import MIB, VARIANTS, HostileReading, Report
 
 MAX_MEMORY = 64 * MIB
 """Memory of a reader above the size of the file [bytes]."""

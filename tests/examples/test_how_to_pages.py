@@ -35,7 +35,7 @@ def test_example_plugin_imports_stable_names_only(path: Path) -> None:
 
 
 PAGES = ROOT / "docs" / "how-to"
-PIP = ROOT / "tests" / "support" / "processes/built_pip.py"
+PIP = ROOT / "tests" / "examples" / "built_pip.py"
 NAMES = [
     "a-plate-for-a-weekend",
     "bring-your-own-method",

@@ -20,7 +20,7 @@ from processes.daemons import (
     ready_daemon,
     until_state,
 )
-from processes.typed_page import installed_program
+from processes.installed import installed_program
 
 ROOT = Path(__file__).parents[2]
 

@@ -14,7 +14,7 @@ import pytest
 from drivers.by_hand.actions import identify_amplifier
 from drivers.wires.serial_frames import Frame, encode_frame
 from kit.clock import judged
-from processes.typed_page import installed_program
+from processes.installed import installed_program
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,7 +53,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     library = tmp_path_factory.mktemp("smallest") / "moved.so"
     compiler = installed_program("cc", package="gcc")
     command = [compiler, *BUILD.split(), f"-I{SOURCE.parent}", "-o", library]
-    command += [ROOT / "tests" / "support" / "moved_smallest.c", "-lm"]
+    command += [ROOT / "tests" / "programs" / "moved_smallest.c", "-lm"]
     subprocess.run(command, check=True)
     return library
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from processes.typed_page import installed_program
+from processes.installed import installed_program
 
 ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "examples" / "systemd"

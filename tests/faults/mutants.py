@@ -29,7 +29,7 @@ from pathlib import Path
 
 from copies import FORK, ROOT, changed_copy, prepare, run_tests, sound_copy
 
-sys.path.insert(0, str(ROOT / "tests" / "support"))
+sys.path.insert(0, str(ROOT / "tests" / "programs"))
 from time_limit import TimeLimit
 
 PACKAGES = ("model", "controller", "drivers", "sim", "era_haptics/lab")

@@ -20,6 +20,7 @@ from copies import ROOT, sound_copy
 from planting import is_private
 
 sys.path.insert(0, str(ROOT / "tests" / "support"))
+sys.path.insert(0, str(ROOT / "tests" / "programs"))
 from packages import PACKAGES
 
 FOREIGN = {name for name in dir(__import__("asyncio").Handle) if is_private(name)}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from processes.firmware_machine import build_firmware
-from processes.typed_page import needs
+from processes.installed import needs
+from tests.firmware.firmware_machine import build_firmware
 
 
 @pytest.fixture(scope="session")

@@ -52,7 +52,10 @@ from kit.clock import judged
 from kit.hand_frames import tone as command
 from kit.wires import MASTERS, damage, drive
 from model.arrays import FloatArray
-from processes.firmware_machine import (
+from processes.installed import installed_program
+from registry.limits import GuardLimits
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedEnd
+from tests.firmware.firmware_machine import (
     CAN,
     MODBUS,
     PER_MS,
@@ -72,10 +75,7 @@ from processes.firmware_machine import (
     running_firmware,
     values_of,
 )
-from processes.firmware_machine import LINES as FIRMWARE_KINDS
-from processes.typed_page import installed_program
-from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedEnd
+from tests.firmware.firmware_machine import LINES as FIRMWARE_KINDS
 
 ROOT = Path(__file__).parents[2]
 WORD = WireQuantity("word", "u16", 1, "", 0, 0xFFFF)

@@ -14,7 +14,7 @@ import pytest
 from drivers.protocol.definition import MESSAGES
 from drivers.wires.modbus_frames import framed
 from kit import hand_frames as hand
-from processes.firmware_machine import (
+from tests.firmware.firmware_machine import (
     CAN,
     MODBUS,
     SERIAL,

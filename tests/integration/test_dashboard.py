@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-import dashboard_pictures
 from cases import shortly
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
@@ -49,7 +48,7 @@ READY, ENABLED, STOPPED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED", "QUICK_STOP
 LENGTH, WIDTH = 0.3048, 0.2286  # m; 12 by 9 inches, as in the rig's file
 DESKTOP, PHONE = SCREENS[0], SCREENS[2]
 WORD = "document.querySelector('#state').textContent"
-PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
+PROBES = Path(__file__).with_name("page_probes.js").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

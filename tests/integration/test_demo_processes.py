@@ -24,8 +24,8 @@ from processes.gateways import (
     wait_for,
     wait_for_state,
 )
+from processes.installed import ERA
 from processes.patient_daemon import wait_long
-from processes.typed_page import ERA
 
 ENABLED = "OPERATION_ENABLED"
 

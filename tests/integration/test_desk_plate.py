@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.rig.rig_file import load_rig
-from processes.desk import DEVICE, PLATE, Desk, desk, identified_errors, session
+from tests.integration.desk import DEVICE, PLATE, Desk, desk, identified_errors, session
 
 SEED, DESK_MESH = 3, "6x4 Q3"
 

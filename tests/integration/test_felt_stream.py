@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from cases import shortly
-from kit.chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
 from kit.direct_plate import direct_responder
 from kit.plates import TWO_AMPLIFIERS, write_rig
 from kit.set_table import only
@@ -43,6 +42,16 @@ from sim.far_ends.wire_assignment import FAR_ENDS
 from sim.plant.era_motions import harmonics_of_layer, realised
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.plant.plant import PLANT_SAMPLE_RATE, Plant
+from tests.integration.streams import (
+    LEVEL_DB_SL,
+    ONSET,
+    SENSORS,
+    Heard,
+    Played,
+    Situation,
+    Stream,
+    play_stream,
+)
 
 STROKE = 100e-6  # m; of every ERA in the example
 JUDGED_UP_TO = 25.0  # dB; no model predicts what a quiet finger feels beyond that

@@ -9,7 +9,6 @@ from unittest.mock import Mock
 
 import pytest
 
-import dashboard_pictures
 from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import LayoutEvent, PatternEvent, StateEvent
@@ -36,7 +35,7 @@ BANNER = "document.querySelector('#banner').innerText"
 EVENTS = "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
 NOTES = "document.querySelectorAll('#log li:first-child .note').length"
 TILE = "document.querySelector('.tile')?.innerText ?? ''"
-PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
+PROBES = Path(__file__).with_name("page_probes.js").read_text(encoding="utf-8")
 
 
 @pytest.mark.long

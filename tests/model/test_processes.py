@@ -82,7 +82,7 @@ def test_workers_end_with_a_program_that_is_killed() -> None:
 
 # Versions
 
-REMEDY = "increase NUMERICS_VERSION and run python tests/support/reference_figures.py"
+REMEDY = "increase NUMERICS_VERSION and run python tests/programs/reference_figures.py"
 
 
 def test_numerics_version_changes_when_figures_change() -> None:

@@ -23,9 +23,6 @@ from model.fem import assemble
 from model.finger import fingertip_points
 from model.rig.rig import Rig
 from model.structure.fingertips import Fingertip, FingertipLoad
-from processes.firmware_machine import SESSION as BENCH_SESSION
-from processes.firmware_machine import arm_bench, keep_alive
-from processes.firmware_machine import play as play_at_once
 from registry.limits import HAND_LOAD
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.bench.bench import Bench
@@ -33,6 +30,9 @@ from sim.control import SimulationContext, execute
 from sim.plant.era_motions import motion_of
 from sim.plant.finger_placement import FingerPlacement
 from sim.plant.imperfections import Imperfections
+from tests.sim.armed_bench import SESSION as BENCH_SESSION
+from tests.sim.armed_bench import arm_bench, keep_alive
+from tests.sim.armed_bench import play as play_at_once
 
 AT = (0.08, 0.06)
 

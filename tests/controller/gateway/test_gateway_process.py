@@ -51,7 +51,7 @@ from processes.gateways import (
     wait_for,
     wait_for_daemon,
 )
-from processes.typed_page import installed_program
+from processes.installed import installed_program
 
 
 def test_gateway_exits_at_sigint_with_open_connections(

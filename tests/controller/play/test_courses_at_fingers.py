@@ -25,6 +25,7 @@ from controller.sources.touch import Contact, ContactKey
 from kit.chain import Position
 from kit.clock import in_virtual_time
 from kit.fingers import table as paper_table
+from kit.magnets import STEP, Magnets
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
 from model.answer.envelope import STRONGEST
@@ -37,7 +38,6 @@ from model.rig.rig_file import load_rig, parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import Envelopes
-from processes.sound_cards import STEP, Magnets
 from sim.far_ends.wire_assignment import SimulatedWire
 from tests.controller.play.fingers_on_layouts import (
     ABOVE,

@@ -15,7 +15,6 @@ import pytest
 
 from kit.direct_plate import direct_acceleration
 from kit.plates import as_sold, exciter_rig, exciter_rig_text
-from kit.thin_plates import Hidden, draw, parameters_held
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
@@ -39,6 +38,7 @@ from model.structure.exciter import Exciter
 from model.structure.material import Material, Orthotropy
 from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
 from model.study.expected_contrast import expected_contrast
+from tests.model.estimate.thin_plates import Hidden, draw, parameters_held
 
 FREQUENCIES = np.linspace(40.0, 500.0, 21)
 

@@ -32,7 +32,7 @@ from kit.plates import (
     random_gains,
     write_rig,
 )
-from kit.thin_plates import FAULTS, draw, measured_fault
+from tests.model.estimate.thin_plates import FAULTS, draw, measured_fault
 from kit.weekend_boards import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError

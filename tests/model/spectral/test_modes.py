@@ -16,7 +16,6 @@ from scipy.integrate import trapezoid
 from scipy.sparse.linalg import spsolve
 
 from cases import in_turn
-from kit.layered_strips import strip_frequencies
 from kit.plates import make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -45,6 +44,7 @@ from model.structure.plate import (
 )
 from model.structure.sources import Era
 from model.vibration import natural_modes
+from tests.model.layered_strips import strip_frequencies
 
 RIG = make_paper_rig(12, 9)
 PAPER = RIG.plate

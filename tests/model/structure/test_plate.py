@@ -13,7 +13,6 @@ import pytest
 
 from cases import in_turn, shortly
 from kit.direct_plate import direct_acceleration
-from kit.layered_strips import wave_number
 from kit.plates import ALUMINIUM, exciter_rig, make_paper_rig
 from model.arrays import FloatArray, lattice
 from model.errors import InputError
@@ -52,6 +51,7 @@ from model.structure.statics import (
     support_problem,
 )
 from model.vibration import natural_modes, reference_mesh
+from tests.model.layered_strips import wave_number
 
 # Exciters
 

@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import StateSpace, lsim
 
 from cases import shortly
+from kit.magnets import STEP, Magnets
 from kit.plates import exciter_rig, make_paper_rig
 from model.answer.envelope import swings_of_pulse
 from model.arrays import FloatArray
@@ -47,7 +48,6 @@ from model.transients.time_response import (
     plate_in_time,
 )
 from model.vibration import Tone
-from processes.sound_cards import STEP, Magnets
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 

@@ -29,7 +29,6 @@ from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration import Tone as VibrationTone
-from processes.firmware_machine import arm_bench, keep_alive, play
 from sim.amplifier.amplifier_clock import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.era_motions import motion_of
@@ -41,6 +40,7 @@ from sim.plant.imperfections import (
     PlateErrors,
     draw_imperfections,
 )
+from tests.sim.armed_bench import arm_bench, keep_alive, play
 
 FINGER = (0.08, 0.06)
 PERFECT = Imperfections()

@@ -33,12 +33,11 @@ from model.arrays import ComplexArray, Float32Array
 from model.errors import InputError
 from processes.daemons import PATIENCE
 from processes.gateways import wait_for
+from processes.installed import ERA
 from processes.jack_recorder import Capture
 from processes.sound_cards import BLOCK as CARD_BLOCK
 from processes.sound_cards import RATE as CARD_RATE
-from processes.sound_cards import SoftAmp, host, jack_server
-from processes.steady_host import WATCHDOG, linear_amplifier
-from processes.typed_page import ERA
+from processes.sound_cards import SoftAmp, jack_server
 from sim.soft_amp.engine import Counters, library, start_engine
 from sim.soft_amp.output import default_block, may_be_realtime, portaudio_device, portaudio_stream
 from sim.soft_amp.settings import (
@@ -48,6 +47,7 @@ from sim.soft_amp.settings import (
     SoftAmplifierSettings,
     terminal_place,
 )
+from tests.sim.soft_amp.steady_host import WATCHDOG, linear_amplifier, playing_host
 
 CHANNELS = 2
 RATE = 96_000  # not the usual one
@@ -384,7 +384,7 @@ def test_samples_arrive_at_jack_as_commanded(tmp_path: Path) -> None:
         capture = Capture(name, "card", CARD_CHANNELS)
         amp = amplifier_on("card, JACK", CARD_CHANNELS, name, tmp_path)
         assert f"{RATE} Hz, blocks of {CARD_BLOCK} frames" in amp.log
-        with host(amp.url, CARD_CHANNELS) as playing:
+        with playing_host(amp.url, CARD_CHANNELS) as playing:
             wait_for(lambda: capture.has_sounded_for(2.3))  # 0.2 s of soft start and ramp
             amplitude_of = amplitudes(capture.samples(2 * RATE), RATE)
             sizes = np.median(np.abs(amplitude_of), axis=0)
@@ -417,7 +417,7 @@ async def test_killed_or_stopped_amplifier_is_silent_and_restarts_disarmed(
     """
     is_watched = how is signal.SIGSTOP
     amp = amplifier_on("system, JACK", CARD_CHANNELS, server, tmp_path, is_watched=is_watched)
-    with host(amp.url, CARD_CHANNELS):
+    with playing_host(amp.url, CARD_CHANNELS):
         wait_for(card.is_sounding)
         position = card.position
         os.kill(amp.process.pid, how)
@@ -475,7 +475,7 @@ async def test_silence_is_an_open_output_of_zeros(server: str, tmp_path: Path) -
     lines = Lines()
 
     async def silent(end: Callable[[Amplifier], Awaitable[object]] | None) -> None:
-        with host(soft_amp.url, 2) as playing:
+        with playing_host(soft_amp.url, 2) as playing:
             wait_for(capture.is_sounding)
             playing.kill()
             playing.wait()
@@ -507,7 +507,7 @@ def test_square_law_plays_the_root_of_a_bias_and_the_force(
     """u = sqrt((1 + force) / 2), so that 2 u² - 1 has the amplitude 0.5 of the force; over TCP."""
     capture = Capture(server, "other", 2)
     soft_amp = amplifier_on("other, JACK", 2, server, tmp_path, line, "0", "--law", "square")
-    with host(soft_amp.url, 2):
+    with playing_host(soft_amp.url, 2):
         wait_for(lambda: capture.has_sounded_for(1.3))  # 0.2 s of soft start and ramp
         forces = 2 * capture.samples(CARD_RATE) ** 2 - 1
         windows = forces.reshape(20, CARD_RATE // 20, 2)

@@ -1,8 +1,7 @@
 """The plate behind a sound card: samples of all outputs in, samples of all inputs out.
 
-As a client of a JACK server its inputs are an interface's outputs, and the reverse. What the plate
-really is is drawn within what a rig's drawing leaves open; its accelerations become samples with
-the noise, filter, delay and clipping of a sound card's inputs.
+The true plate is drawn within what a rig's drawing leaves open; its accelerations become samples
+with the noise, filter, delay and clipping of a sound card's inputs.
 
 The linear system is sampled exactly, many samples by one product of a matrix: the input is straight
 between samples (a hold of first order; one of zeroth order would be half a sample late). In the
@@ -21,16 +20,14 @@ frequency.
 """
 
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import linalg, signal
 
-from drivers.errors import LinkError
 from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.sensor_file import WiredSensor, are_positions
 from model.arrays import ComplexArray, FloatArray
@@ -42,9 +39,6 @@ from model.structure.attachments import footprints_of
 from model.structure.fingertips import FingertipLoad, fingertip_loads
 from model.structure.plate import Plate
 from model.structure.sources import Era
-
-if TYPE_CHECKING:
-    import jack
 
 _ORDER = 4
 _CORNER = 0.42  # of the sample rate; anti-aliasing filters of converters pass all of the audio band
@@ -549,51 +543,3 @@ class DeskPlate:
 
 BLOCK_MULTIPLE = SAMPLES
 """Frames of a block must be a multiple of this."""
-
-
-class JackPlate:
-    """Ports in_1.. and out_1.. of a client; each block is advanced in the server's callback.
-
-    Raises InputError for a server whose blocks do not suit.
-    """
-
-    def __init__(self, client: "jack.Client", plate: DeskPlate) -> None:
-        if client.blocksize % BLOCK_MULTIPLE:
-            raise InputError(
-                f"blocks of the JACK server must be a multiple of {BLOCK_MULTIPLE} frames, got "
-                f"{client.blocksize}; start it with -p 128"
-            )
-        self._client, self._plate = client, plate
-        self._problem: Exception | None = None
-        self._ended = threading.Event()
-        for number in range(plate.inputs):
-            client.outports.register(f"out_{number + 1}", is_terminal=True)
-        for number in range(plate.outputs):
-            client.inports.register(f"in_{number + 1}", is_terminal=True)
-
-    def start(self) -> None:
-        """Begin to vibrate."""
-        self._client.set_process_callback(self._advance)
-        self._client.set_shutdown_callback(self._lose)
-        self._client.activate()
-
-    def wait(self, timeout: float) -> None:
-        """Wait for a time [s]; raises what ended the plate."""
-        if self._ended.wait(timeout) and self._problem is not None:
-            raise self._problem
-
-    def _lose(self, _status: object, _reason: object) -> None:
-        self._problem = LinkError("jack: the server has ended; start it, and this again")
-        self._ended.set()
-
-    def _advance(self, _frames: int) -> None:
-        if self._problem is not None:
-            return
-        try:
-            played = np.stack([port.get_array() for port in self._client.inports], axis=1)
-            heard = self._plate.advance(played.astype(float))
-            for port, samples in zip(self._client.outports, heard.T, strict=True):
-                port.get_array()[:] = samples
-        except Exception as problem:  # nothing above catches it in the server's thread
-            self._problem = problem
-            self._ended.set()

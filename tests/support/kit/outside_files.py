@@ -1,6 +1,6 @@
 """Every reader of files from outside, by the name of such a file, and a valid file for each.
 
-A reader that is missing here is not tested against hostile files (`processes.hostile_files`).
+A reader that is missing here is not tested against hostile files (`tests.errors.hostile_files`).
 """
 
 import contextlib

@@ -55,8 +55,8 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
+from processes.installed import ERA
 from processes.patient_daemon import PROGRAM, allow_long_watchdogs, wait_long
-from processes.typed_page import ERA
 from registry import threads
 from registry.limits import GuardLimits
 from registry.service_manager import ServiceManager

@@ -63,8 +63,8 @@ from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
 from processes.daemons import PATIENCE, daemon_table, write_daemon
+from processes.installed import ERA, installed_program
 from processes.patient_daemon import RESTING
-from processes.typed_page import ERA, installed_program
 
 T = TypeVar("T")
 TOKEN = "a-token-of-these-tests-only"

@@ -35,8 +35,8 @@ from model.response_files import measurement_of, read_measured
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
-from processes.sound_cards import DeskCard
 from sim.soft_amp.engine import callback_address
+from tests.era_haptics.lab.measuring.card_in_memory import DeskCard
 
 PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
 SENSORS = tuple(

@@ -21,7 +21,7 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from processes.sound_cards import DeskCard
+from tests.era_haptics.lab.measuring.card_in_memory import DeskCard
 
 RATE = 8_000.0
 EXAMPLE = Path(__file__).parents[4] / "examples" / "desk" / "rig.yaml"

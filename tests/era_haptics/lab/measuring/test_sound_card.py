@@ -31,10 +31,11 @@ from model.response_files import measurement_of, read_measured
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from processes.gateways import wait_for
+from processes.installed import ERA
 from processes.interrupted import full_disk
 from processes.jack_recorder import Capture
-from processes.sound_cards import DeskCard, JackServer, jack_server
-from processes.typed_page import ERA
+from processes.sound_cards import JackServer, jack_server
+from tests.era_haptics.lab.measuring.card_in_memory import DeskCard
 
 RATE = 8_000.0
 LEVEL = 0.3

@@ -1,6 +1,6 @@
 """Daemons that are killed at random moments: when does every channel fall silent?
 
-    python tests/support/kills.py [--kills 200] [--seed 1]
+    python tests/programs/kills.py [--kills 200] [--seed 1]
 
 Each is `era daemon`, a process of its own, over a real wire; a client arms it, moves fingers about,
 lifts them, disarms, stops. The amplifiers stay the same from one daemon to the next, which must
@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable

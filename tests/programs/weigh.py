@@ -18,6 +18,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from packages import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,23 +1,77 @@
 """A plate without hardware, as a client of a JACK server.
 
-python tests/support/desk_plate.py RIG --sensors SENSORS.csv
+python tests/programs/desk_plate.py RIG --sensors SENSORS.csv
 """
 
 import json
 import select
 import sys
+import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from drivers.errors import LinkError
-from kit.desk_plate import DeskPlate, JackPlate
+from kit.desk_plate import BLOCK_MULTIPLE, DeskPlate
 from model.commands.options import RigArgument
 from model.errors import InputError
 
+if TYPE_CHECKING:
+    import jack
+
 _POLL = 0.05  # s
+
+
+class JackPlate:
+    """Ports in_1.. and out_1.. of a client; each block is advanced in the server's callback.
+
+    Raises InputError for a server whose blocks do not suit.
+    """
+
+    def __init__(self, client: "jack.Client", plate: DeskPlate) -> None:
+        if client.blocksize % BLOCK_MULTIPLE:
+            raise InputError(
+                f"blocks of the JACK server must be a multiple of {BLOCK_MULTIPLE} frames, got "
+                f"{client.blocksize}; start it with -p 128"
+            )
+        self._client, self._plate = client, plate
+        self._problem: Exception | None = None
+        self._ended = threading.Event()
+        for number in range(plate.inputs):
+            client.outports.register(f"out_{number + 1}", is_terminal=True)
+        for number in range(plate.outputs):
+            client.inports.register(f"in_{number + 1}", is_terminal=True)
+
+    def start(self) -> None:
+        """Begin to vibrate."""
+        self._client.set_process_callback(self._advance)
+        self._client.set_shutdown_callback(self._lose)
+        self._client.activate()
+
+    def wait(self, timeout: float) -> None:
+        """Wait for a time [s]; raises what ended the plate."""
+        if self._ended.wait(timeout) and self._problem is not None:
+            raise self._problem
+
+    def _lose(self, _status: object, _reason: object) -> None:
+        self._problem = LinkError("jack: the server has ended; start it, and this again")
+        self._ended.set()
+
+    def _advance(self, _frames: int) -> None:
+        if self._problem is not None:
+            return
+        try:
+            played = np.stack([port.get_array() for port in self._client.inports], axis=1)
+            heard = self._plate.advance(played.astype(float))
+            for port, samples in zip(self._client.outports, heard.T, strict=True):
+                port.get_array()[:] = samples
+        except Exception as problem:  # nothing above catches it in the server's thread
+            self._problem = problem
+            self._ended.set()
 
 
 def desk_plate(

@@ -1,6 +1,6 @@
 """True errors of responses in polynomials against their estimates, over many plates and layouts.
 
-    python tests/support/error_estimates.py
+    python tests/programs/error_estimates.py
 
 prints a row for every plate. It fails if an error above 0.25 % is more than 1.4 times its estimate.
 The true response is the one with elements of fifth order, 2.5 times finer than an accurate mesh,

@@ -1,6 +1,6 @@
 """The same on every processor? Tests and answers with the arithmetic of several of them.
 
-    python tests/support/kernels.py [--answers] [--workers N]
+    python tests/programs/kernels.py [--answers] [--workers N]
 
 OpenBLAS has kernels of its own for each kind of processor, which round in different ways, and so do
 our compiled ones of 4, 8 and 16 lanes. First a fixed set of questions is answered with all of them,
@@ -22,6 +22,7 @@ from ctypes import CDLL, c_char_p
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from build_libraries import kernel_library, update
 from model.answer.stimulus import Placement
 from model.compiled.kernels import processor_features
@@ -128,7 +129,7 @@ def environment_of(processor: Processor) -> Iterator[dict[str, str]]:
             **os.environ,
             "OPENBLAS_CORETYPE": processor.blas,
             "OPENBLAS_NUM_THREADS": "1",
-            "PYTHONPATH": os.pathsep.join([folder, str(ROOT / "tests" / "support")]),
+            "PYTHONPATH": folder,
         }
 
 

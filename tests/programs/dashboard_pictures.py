@@ -1,6 +1,6 @@
 """Take pictures of the dashboard on every screen.
 
-    python tests/support/dashboard_pictures.py FOLDER
+    python tests/programs/dashboard_pictures.py FOLDER
 
 A daemon over a simulated amplifier is armed, and two people have a finger each on the plate. The
 screens are a desktop, a tablet and phones. docs/pictures/dashboard.png is dashboard_desktop.png.
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from controller.demo.demonstration import layout_of_people
 from kit.plates import make_paper_rig
 from model.table.table_file import build_table

@@ -8,7 +8,7 @@ import ctypes
 import random
 import struct
 import subprocess
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -16,28 +16,25 @@ from typing import NamedTuple
 import numpy as np
 from cobs import cobs
 
-from drivers.playing import AmplifierTone
 from drivers.protocol.definition import (
     BY_NUMBER,
     EVENT,
     EVENT_RECORD,
     NAK,
     NAK_RECORD,
-    QUANTITIES,
     VERSION,
 )
 from drivers.protocol.records import Record, Values
-from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts, token_after
+from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, token_after
 from drivers.wires.can_frames import SLCAN, TextReader, pack_frames, unpack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame, pack_words, unpack_words
 from kit import hand_frames as hand
 from model.arrays import FloatArray
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.bench.bench import Bench
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
-FIRMWARE = Path(__file__).parents[3] / "firmware"
+FIRMWARE = Path(__file__).parents[2] / "firmware"
 
 
 def build_firmware(folder: Path, program: str, *options: str) -> Path:
@@ -355,48 +352,3 @@ def replay(
         if frame[0] & hand.REPLY
     ]
     return firmware.samples(), replies
-
-
-_Q = QUANTITIES
-
-
-def arm_bench(bench: Bench, watchdog: float, *, now: float, name: str = "main") -> None:
-    """Arm an amplifier at a time [s], with a watchdog [s]."""
-    values = {"session": SESSION, "watchdog": _Q["watchdog"].to_wire(watchdog), "shift": 0}
-    bench.exchange(name, "Arm", values, now=now)
-
-
-def play(
-    bench: Bench,
-    *tones: AmplifierTone,
-    now: float,
-    name: str = "main",
-    token: int = 1,
-    ramp: float = 0.0,
-    watchdog: float | None = None,
-) -> None:
-    """Play tones in layer 0 at a time [s]; watchdog [s]: arm before, None where it is armed."""
-    if watchdog is not None:
-        arm_bench(bench, watchdog, now=now, name=name)
-    commands = [
-        Command(
-            tone.channel,
-            _Q["frequency"].to_wire(tone.frequency),
-            _Q["level"].to_wire(tone.level),
-            _Q["phase"].to_wire(tone.phase),
-        )
-        for tone in tones
-    ]
-    layer = LayerSet(0, _Q["ramp"].to_wire(ramp), 0, tuple(commands))
-    for part in parts(pack_layers([layer]), session=SESSION, token=token, now=True):
-        bench.exchange(name, "Set", part, now=now)
-
-
-def keep_alive(
-    bench: Bench, until: float, *, every: float = 0.5, names: Collection[str] | None = None
-) -> None:
-    """Advance to a time [s], with heartbeats to these amplifiers, None for all."""
-    while (now := bench.time + every) < until:
-        for name in names or bench.amplifiers:
-            bench.exchange(name, "Ping", {"session": SESSION, "rate": 0}, now=now)
-    bench.advance(until)

@@ -1,6 +1,6 @@
 """Taps by the thousand while every frame is late: no amplifier may be taken for faulty.
 
-    python tests/support/late_taps.py [--taps N] [--first SEED]
+    python tests/programs/late_taps.py [--taps N] [--first SEED]
 
 One and three amplifiers on one line of each kind, in virtual time. What passes a line is late by up
 to 16 ms either way, at random, as behind a USB adapter with its latency timer; some frames come
@@ -18,7 +18,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import DriverError

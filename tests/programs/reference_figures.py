@@ -1,15 +1,17 @@
 """Figures of the model that decide whether kept results can be reused, and their record.
 
-    python tests/support/reference_figures.py
+    python tests/programs/reference_figures.py
 
 records them with the present NUMERICS_VERSION.
 """
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from era_haptics.lab.design.layout_search import LayoutSearch
 from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
 from kit.plates import make_paper_rig, small_problem

@@ -1,6 +1,6 @@
 """Run the tests nearest to what differs from a commit: `make test-changed`.
 
-    python tests/support/changed_tests.py [--since COMMIT] [--seconds N] [--list]
+    python tests/programs/changed_tests.py [--since COMMIT] [--seconds N] [--list]
 
 Order: changed tests; tests in the folder of the changed file; tests that import the file, directly
 or through other modules. A file that is no module has the tests that name it. Files reached only
@@ -24,14 +24,15 @@ from pathlib import Path
 import grimp
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from cases import SLOWEST
 from packages import PACKAGES
 from time_limit import TimeLimit
 
 ROOT = Path(__file__).parents[2]
 IMPORTED = (*PACKAGES, "benchmarks")
-FLAT = ("tests/support", "docs/generators", "examples")
-"""Folders whose modules are imported by their bare names."""
+ON_PATH = ("tests/support/", "tests/programs/", "tests/faults/", "docs/generators/", "examples/")
+"""Folders of programs, whose modules are imported by their names in the folder."""
 
 ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (
@@ -192,7 +193,10 @@ def _node(path: str) -> str:
         return name.replace("/", ".")
     if path.startswith("tests/support/"):
         return name.removeprefix("tests/support/").replace("/", ".")
-    return path if path in _tests() else name.rpartition("/")[2]
+    if path in _tests():
+        return path
+    is_on_path = path.startswith(ON_PATH) or name.endswith("conftest")
+    return name.rpartition("/")[2] if is_on_path else name.replace("/", ".")
 
 
 def _tests_beside(path: str) -> Iterator[str]:
@@ -225,8 +229,8 @@ def _importers() -> Mapping[str, set[str]]:
     importers: dict[str, set[str]] = defaultdict(set)
     for module in graph.modules:
         importers[module] = graph.find_modules_that_directly_import(module)
-    files = [ROOT / path for path in _tests()]
-    for folder in FLAT:
+    files: list[Path] = []
+    for folder in ("tests", "docs/generators", "examples"):
         files += (ROOT / folder).rglob("*.py")
     for file in files:
         node = _node(file.relative_to(ROOT).as_posix())

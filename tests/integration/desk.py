@@ -36,8 +36,8 @@ from processes.jack_recorder import Capture
 from processes.sound_cards import JACK_PRIORITY, soft_amp_program
 
 ERA = Path(sys.executable).with_name("era")
-_ROOT = Path(__file__).parents[3]
-_PROGRAM = _ROOT / "tests" / "support" / "desk_plate.py"
+_ROOT = Path(__file__).parents[2]
+_PROGRAM = _ROOT / "tests" / "programs" / "desk_plate.py"
 PLATE = (sys.executable, str(_PROGRAM), "rig.yaml", "--sensors", "sensors.csv")
 EXAMPLES = _ROOT / "examples" / "desk"
 RATE, BLOCK = 48_000, 512

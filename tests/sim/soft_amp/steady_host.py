@@ -1,14 +1,19 @@
 """A host that plays 1 kHz at level 0.5 on every channel of a linear amplifier, until killed.
 
-    python tests/support/processes/steady_host.py URL CHANNELS
+    python tests/sim/soft_amp/steady_host.py URL CHANNELS
 
 Each channel is 30 degrees ahead of the one before. It prints `armed`. The amplifier waits for it as
 long as the protocol allows, and after a longer stall of the machine it plays again.
 """
 
 import asyncio
+import contextlib
+import os
+import signal
+import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +29,7 @@ from registry.limits import GuardLimits
 LIMITS = GuardLimits(40, 1000, 1.0)
 WATCHDOG = QUANTITIES["watchdog"].high  # s
 _BEAT = 0.1  # s
+_SUPPORT = Path(__file__).parents[2] / "support"
 
 
 async def linear_amplifier(lines: Lines, url: str) -> Amplifier:
@@ -53,6 +59,22 @@ async def _play(group: Group, tones: Sequence[AmplifierTone]) -> None:
     while True:
         await group.beat()
         await asyncio.sleep(_BEAT)
+
+
+@contextlib.contextmanager
+def playing_host(url: str, channels: int) -> Iterator["subprocess.Popen[str]"]:
+    """A program that plays 1 kHz at level 0.5 on every channel, each 30 degrees ahead."""
+    with subprocess.Popen(
+        [sys.executable, __file__, url, str(channels)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(_SUPPORT)},
+    ) as process:
+        assert process.stdout.readline() == "armed\n"
+        yield process
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGKILL)
 
 
 if __name__ == "__main__":

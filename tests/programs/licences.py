@@ -1,6 +1,6 @@
 """The page of licences of all dependencies, from the bills of materials.
 
-    python tests/support/licences.py dist/sbom.json dist/sbom-extras.json \
+    python tests/programs/licences.py dist/sbom.json dist/sbom-extras.json \
         > docs/reference/licences.md
 
 `make licences` makes both bills and the page.

@@ -1,7 +1,10 @@
 """The demonstration to be touched, with a small table: python live_demonstration.py."""
 
 import asyncio
+import sys
+from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from controller.demo.demonstration import run_live
 from kit.plates import small_table
 from model.rig.rig_file import example_rig_path

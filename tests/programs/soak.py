@@ -1,7 +1,7 @@
 """Soak: the whole chain in virtual time, thousands of times, each time by another number.
 
-python tests/support/soak.py --minutes 600                       4000 short ones and 500 long ones
-python tests/support/soak.py --seed 17 --trace trace.txt         one of the long again, all of it
+python tests/programs/soak.py --minutes 600                       4000 short ones and 500 long ones
+python tests/programs/soak.py --seed 17 --trace trace.txt         one of the long again, all of it
 """
 
 import argparse
@@ -21,6 +21,7 @@ from typing import TypeAlias
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from soak_runs import KINDS, PLATES, Plan, make_plan, run_plan  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
@@ -91,7 +92,7 @@ def main() -> int:
     jobs = [(number, short) for short, count in counts.items() for number in range(count)]
     jobs.sort(key=lambda job: job[0] / counts[job[1]])  # evenly mixed
     jobs = [(options.first + number, short) for number, short in jobs]
-    again = "python tests/support/soak.py" + f" --wire {options.wire}" * bool(options.wire)
+    again = "python tests/programs/soak.py" + f" --wire {options.wire}" * bool(options.wire)
     again += f" --plate {options.plate}" * bool(options.plate)
     with get_context("spawn").Pool(options.workers) as pool:
         found = pool.imap_unordered(partial(run_seed, wire=options.wire, plate=options.plate), jobs)

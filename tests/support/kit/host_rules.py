@@ -100,10 +100,10 @@ class RuleViolation:
 
     rule: str
     time: float
-    what: str
+    problem: str
 
     def __str__(self) -> str:
-        return f"{self.time:.6f} {self.rule}: {self.what}"
+        return f"{self.time:.6f} {self.rule}: {self.problem}"
 
 
 @dataclass(frozen=True)
@@ -228,15 +228,15 @@ class _Deadline:
 
     due: float
     rule: str
-    what: str
+    problem: str
     is_kept: Callable[[], bool]
 
 
 class _JudgedLines(Lines):
     """The lines of a host, each of which shows its requests and arrivals to the rules."""
 
-    def __init__(self, before: Lines | None, rules: "HostRules") -> None:
-        super().__init__(before)
+    def __init__(self, former_lines: Lines | None, rules: "HostRules") -> None:
+        super().__init__(former_lines)
         self._rules = rules
 
     async def open_line(self, address: WireAddress) -> Any:
@@ -350,11 +350,12 @@ class HostRules:
         """Replace the contacts; must_be_felt: whether new ones must lead to a pattern."""
         self.advance()
         time = threads.now()
-        before, self._contacts = self._contacts or frozenset(), frozenset(contacts)
-        new_contacts = self._contacts - before
+        former_contacts = self._contacts or frozenset()
+        self._contacts = frozenset(contacts)
+        new_contacts = self._contacts - former_contacts
         if new_contacts:
             self._last_touch = time
-        if before and not self._contacts:
+        if former_contacts and not self._contacts:
             self._last_lift = time
             for amplifier in self.amplifiers.values():
                 self._expect_silence(amplifier, time)
@@ -679,9 +680,9 @@ class HostRules:
             for command in playback.playing(layer).commands:
                 tones.setdefault(command.channel, []).append(_tone_of(command))
         wanted = {
-            channel: list(each)
-            for channel, each in expected.get(amplifier.name, {}).items()
-            if each
+            channel: list(channel_tones)
+            for channel, channel_tones in expected.get(amplifier.name, {}).items()
+            if channel_tones
         }
         if not _are_same(tones, wanted):
             self._report(
@@ -764,25 +765,25 @@ class HostRules:
             if channel >= self.limits.channels or not voices:
                 continue
             level, slew = _sum_of(voices, time)
-            for what, value, limit in (
+            for quantity, value, limit in (
                 ("level", level, self.limits.level),
                 ("rise", slew, self.limits.slew),
             ):
                 if value > limit * _SUM_TOLERANCE + _LEVEL.step:
                     self._report(
                         "limits",
-                        f"{amplifier.name}: {what} of channel {channel}, sum of all layers, must "
-                        f"be at most {limit:g}, got {value:.4g}",
+                        f"{amplifier.name}: {quantity} of channel {channel}, sum of all layers, "
+                        f"must be at most {limit:g}, got {value:.4g}",
                     )
 
     # Deadlines
 
     def _expect(
-        self, since: float, limit: float, rule: str, what: str, is_kept: Callable[[], bool]
+        self, since: float, limit: float, rule: str, problem: str, is_kept: Callable[[], bool]
     ) -> None:
-        """Expect something within a limit of a time; what: to be reported otherwise."""
-        what = f"{what} within {limit * 1e3:g} ms of {since:.4f} s"
-        self._deadlines.append(_Deadline(since + limit, rule, what, is_kept))
+        """Expect something within a limit of a time; problem: report otherwise."""
+        problem = f"{problem} within {limit * 1e3:g} ms of {since:.4f} s"
+        self._deadlines.append(_Deadline(since + limit, rule, problem, is_kept))
 
     def _expect_stop(self, amplifier: HostedAmplifier, time: float) -> None:
         """An operator's stop must be sent, unless the reply to one is awaited."""
@@ -794,8 +795,8 @@ class HostRules:
         def is_sent() -> bool:
             return self._requested_stops.get(amplifier.name) != time or not amplifier.is_open
 
-        what = f"operator's stop not sent to {amplifier.name}"
-        self._expect(time, self.times.stop, "stop", what, is_sent)
+        problem = f"operator's stop not sent to {amplifier.name}"
+        self._expect(time, self.times.stop, "stop", problem, is_sent)
 
     def _expect_confirmation(self, amplifier: HostedAmplifier, time: float, first: float) -> None:
         """A stop must be confirmed, or go on: it is repeated, or the status is read."""
@@ -804,10 +805,15 @@ class HostRules:
             is_over = amplifier.unconfirmed_stop != first or not amplifier.is_open
             return is_over or amplifier.stop_continued_at > time
 
-        on_wire = [each for each in self.amplifiers.values() if each.wire == amplifier.wire]
+        names_on_wire = [
+            neighbor.name
+            for neighbor in self.amplifiers.values()
+            if neighbor.wire == amplifier.wire
+        ]
         if time <= first + _STOP_DURATION - _STOP_INTERVAL:
-            what = f"stop of {amplifier.name} neither confirmed nor repeated"
-            self._expect(time, _STOP_INTERVAL * len(on_wire), "stop", what, goes_on)
+            problem = f"stop of {amplifier.name} neither confirmed nor repeated"
+            interval = _STOP_INTERVAL * len(names_on_wire)
+            self._expect(time, interval, "stop", problem, goes_on)
 
     def _expect_commits(self, first: HostedAmplifier, token: int, time: float) -> None:
         """A set that one amplifier plays is played by all that have it staged."""
@@ -821,8 +827,8 @@ class HostRules:
                 is_silenced = not first.vibrates(time) or first.silenced_at >= time
                 return token in amplifier.committed or is_over or is_silenced
 
-            what = f"set {token}, which {first.name} plays, not committed on {amplifier.name}"
-            self._expect(time, self.times.together, "commit", what, is_joined)
+            problem = f"set {token}, which {first.name} plays, not committed on {amplifier.name}"
+            self._expect(time, self.times.together, "commit", problem, is_joined)
 
     def _expect_silence(self, amplifier: HostedAmplifier, last_lift: float) -> None:
         """After the last lift every amplifier is silenced."""
@@ -834,8 +840,8 @@ class HostRules:
             is_touched = self._last_touch >= last_lift
             return is_silent or is_given_up or is_touched or self._stalled_since is not None
 
-        what = f"last finger lifted, {amplifier.name} not silenced"
-        self._expect(last_lift, limit, "lift", what, is_silenced)
+        problem = f"last finger lifted, {amplifier.name} not silenced"
+        self._expect(last_lift, limit, "lift", problem, is_silenced)
 
     def _expect_pattern(self, contact: Hashable, since: float) -> None:
         """A new contact leads to a pattern."""
@@ -850,8 +856,8 @@ class HostRules:
             )
             return is_lifted or is_excused or is_played or cannot_play
 
-        what = "new contact, but no amplifier plays a pattern"
-        self._expect(since, self.times.touch, "touch", what, has_pattern)
+        problem = "new contact, but no amplifier plays a pattern"
+        self._expect(since, self.times.touch, "touch", problem, has_pattern)
 
     def advance(self) -> None:
         """Judge what is due by now."""
@@ -861,7 +867,7 @@ class HostRules:
             if deadline.due >= time:
                 self._deadlines.append(deadline)
             elif not (self._is_disturbed(deadline.due) or deadline.is_kept()):
-                self._report(deadline.rule, deadline.what)
+                self._report(deadline.rule, deadline.problem)
         for pending in self._pending.values():
             if time > pending.sent_at + self.times.reply and not pending.is_overdue:
                 pending.is_overdue = True
@@ -877,7 +883,7 @@ class HostRules:
         fed_at = amplifier.fed_at
         if fed_at is None or is_ending or not (amplifier.is_open and amplifier.is_enabled):
             return
-        is_waiting = any(each.unanswered_at >= fed_at for each in self.amplifiers.values())
+        is_waiting = any(neighbor.unanswered_at >= fed_at for neighbor in self.amplifiers.values())
         limit = self.times.heartbeat + self.times.slack
         if is_waiting:
             limit += _ATTEMPTS * self.times.reply
@@ -888,19 +894,19 @@ class HostRules:
     def _is_disturbed(self, time: float) -> bool:
         return time <= self._disturbed_until
 
-    def _report(self, rule: str, what: str) -> None:
-        self.violations.append(RuleViolation(rule, threads.now(), what))
+    def _report(self, rule: str, problem: str) -> None:
+        self.violations.append(RuleViolation(rule, threads.now(), problem))
 
 
 def tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:
     """Report each call of a method, before it is carried out."""
     carry_out = getattr(owner, method)
 
-    def told(*arguments: Any) -> Any:
+    def call(*arguments: Any) -> Any:
         tell(*arguments)
         return carry_out(*arguments)
 
-    setattr(owner, method, told)
+    setattr(owner, method, call)
 
 
 def _sum_of(voices: Sequence[Voice], time: float) -> tuple[float, float]:
@@ -932,18 +938,18 @@ def _are_same(tones: Mapping[int, Sequence[Tone]], wanted: Mapping[int, Sequence
     if tones.keys() != wanted.keys():
         return False
     for channel, expected in wanted.items():
-        found = tones[channel]
-        if len(found) != len(expected):
+        played_tones = tones[channel]
+        if len(played_tones) != len(expected):
             return False
         for tone in expected:
-            if not any(_is_same_tone(tone, other) for other in found):
+            if not any(_is_same_tone(tone, played_tone) for played_tone in played_tones):
                 return False
     return True
 
 
-def _is_same_tone(tone: Tone, other: Tone) -> bool:
+def _is_same_tone(first: Tone, second: Tone) -> bool:
     return (
-        abs(tone[0] - other[0]) < _FREQUENCY.step * _STEP
-        and abs(tone[1] - other[1]) < _LEVEL.step * _STEP
-        and abs(math.remainder(tone[2] - other[2], 360.0)) < _PHASE.step * _STEP
+        abs(first[0] - second[0]) < _FREQUENCY.step * _STEP
+        and abs(first[1] - second[1]) < _LEVEL.step * _STEP
+        and abs(math.remainder(first[2] - second[2], 360.0)) < _PHASE.step * _STEP
     )

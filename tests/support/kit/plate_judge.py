@@ -54,10 +54,10 @@ class AmplifierRules(ExpectedAmplifier):
             voices = self.outputs.playback.all_voices[channel]
             commanded = [voice.frequency for voice in voices if not voice.has_ended]
             is_settled = all(voice.transition.end < settled_before for voice in voices)
-            is_other = all(abs(each - frequency) > _HALF_STEP for each in commanded)
+            is_other = all(abs(value - frequency) > _HALF_STEP for value in commanded)
             if commanded and is_settled and is_other:
-                what = f"frequency of channel {channel}"
-                self.report("plays", now, what, expected=commanded, actual=frequency)
+                quantity = f"frequency of channel {channel}"
+                self.report("plays", now, quantity, expected=commanded, actual=frequency)
 
     def _handle(self, name: str, values: Values, now: float) -> Values:
         """Have a request carried out, and compare the reply."""
@@ -105,8 +105,8 @@ class AmplifierRules(ExpectedAmplifier):
     def _note(
         self, rule: str, time: float, quantity: str, *, expected: object, actual: object
     ) -> None:
-        what = f"amplifier {self._name}: {quantity} must be {expected}, got {actual}"
-        self._violations.append(RuleViolation(rule, time, what))
+        problem = f"amplifier {self._name}: {quantity} must be {expected}, got {actual}"
+        self._violations.append(RuleViolation(rule, time, problem))
 
 
 CONTACT_TIMEOUT = 0.150  # s; a source without news for so long has lost its fingers
@@ -141,8 +141,8 @@ class SourceContacts:
         lasts = frame.timeout or CONTACT_TIMEOUT
         end = min(stamp, now) + lasts if math.isfinite(stamp) else -math.inf
         self._now[source] = end, numbers
-        before = min(self._until.get(source, -math.inf), now)
-        self._until[source] = max(end if numbers else -math.inf, before)
+        former_end = min(self._until.get(source, -math.inf), now)
+        self._until[source] = max(end if numbers else -math.inf, former_end)
 
     @property
     def last(self) -> float:
@@ -207,10 +207,10 @@ class PlateJudge:
             after_each(device, partial(self._exchanged, name))
             device.listeners.append(partial(self._received, name))
 
-    def violate(self, what: str) -> None:
+    def violate(self, problem: str) -> None:
         """Record a violation."""
         if len(self.violations) < 20:
-            self.violations.append(f"{self._loop.time() - START:.6f} {what}")
+            self.violations.append(f"{self._loop.time() - START:.6f} {problem}")
 
     def touched(self, frame: TouchFrame, *, must_be_felt: bool) -> None:
         """Note a frame of a source; must_be_felt: whether new contacts must lead to a pattern."""
@@ -284,12 +284,12 @@ class PlateJudge:
         now, amplifiers = self._loop.time(), self._bench.amplifiers.values()
         plays = any(
             tone.silent_from > now
-            for each in amplifiers
-            for output in each.outputs
+            for amplifier in amplifiers
+            for output in amplifier.outputs
             for tone in output
         )
         step = self._step if plays else IDLE_STEP
-        return min(now + step, *(each.next_event for each in amplifiers))
+        return min(now + step, *(amplifier.next_event for amplifier in amplifiers))
 
     def _received(self, name: str, event: Values, at: float) -> None:
         if event["state"] in _FAULTED:
@@ -298,11 +298,11 @@ class PlateJudge:
             self._faulted.pop(name, None)
 
     def _check_loud(self, name: str, level: float, now: float) -> None:
-        bounds = {"it was fed": (self._fed[name], self._watchdog + _SILENCING)}
+        bounds = {"its last feeding": (self._fed[name], self._watchdog + _SILENCING)}
         if self.contacts.last > -math.inf:
             bounds["the last finger"] = (self.contacts.last, RELEASE_WITH_FAULTS)
-        for other in self._faulted.keys() - {name}:
-            bounds[f"the fault of {other}"] = (self._faulted[other], TOGETHER)
-        for what, (since, bound) in bounds.items():
+        for faulted in self._faulted.keys() - {name}:
+            bounds[f"the fault of {faulted}"] = (self._faulted[faulted], TOGETHER)
+        for reason, (since, bound) in bounds.items():
             if now - since > bound:
-                self.violate(f"{name} plays at {level:.4f} {now - since:.4f} s after {what}")
+                self.violate(f"{name} plays at {level:.4f} {now - since:.4f} s after {reason}")

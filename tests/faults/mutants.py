@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures import TimeoutError as RunOutOfTime
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -104,8 +104,8 @@ def mutations(statement: ast.stmt) -> list[Callable[[], object]]:
     for node in _own_nodes(statement):
         match node:
             case ast.Compare(ops=[operator]) if type(operator) in _COMPARISONS:
-                other = _COMPARISONS[type(operator)]()
-                changes.append(partial(setattr, node, "ops", [other]))
+                opposite = _COMPARISONS[type(operator)]()
+                changes.append(partial(setattr, node, "ops", [opposite]))
             case ast.BinOp(op=operator) | ast.AugAssign(op=operator):
                 if type(operator) in _OPERATORS:
                     changes.append(partial(setattr, node, "op", _OPERATORS[type(operator)]()))
@@ -162,17 +162,17 @@ def sampled_mutants(package: str, count: int, seed: int) -> list[Mutant]:
 
 def _mutant(package: str, path: Path, index: int, draw: random.Random) -> Mutant:
     tree = ast.parse(path.read_text("utf-8"))
-    before = ast.unparse(tree)
+    original = ast.unparse(tree)
     statement = list(statements(tree))[index]
     changes = mutations(statement)
     if _is_deletable(statement):
         changes.append(partial(_delete, tree, statement))
     draw.choice(changes)()
-    after = ast.unparse(ast.fix_missing_locations(tree))
-    lines = difflib.unified_diff(before.splitlines(), after.splitlines(), n=1, lineterm="")
+    changed = ast.unparse(ast.fix_missing_locations(tree))
+    lines = difflib.unified_diff(original.splitlines(), changed.splitlines(), n=1, lineterm="")
     difference = "\n".join(f"    {line}" for line in [*lines][3:])
     file = path.relative_to(ROOT).as_posix()
-    return Mutant(package, file, statement.lineno, after, difference)
+    return Mutant(package, file, statement.lineno, changed, difference)
 
 
 def _delete(tree: ast.Module, statement: ast.stmt) -> None:
@@ -189,8 +189,7 @@ def with_tests(mutants: Sequence[Mutant]) -> list[Mutant]:
     result = []
     for mutant in mutants:
         tests = [*nearest([mutant.file])][:MAX_TEST_FILES]
-        values = {name: getattr(mutant, name) for name in mutant.__dataclass_fields__}
-        result.append(Mutant(**{**values, "tests": tuple(tests)}))
+        result.append(replace(mutant, tests=tuple(tests)))
     return result
 
 
@@ -234,6 +233,25 @@ def judged(mutants: Sequence[Mutant], *, workers: int, seconds: float) -> Iterat
             pool.shutdown(cancel_futures=True)
 
 
+def _mutants_in_turn(packages: Sequence[str], count: int, seed: int) -> list[Mutant]:
+    """Return mutants of packages in turn, so that all lose alike if the time is up."""
+    by_package = [sampled_mutants(package, count, seed) for package in packages]
+    mutants: list[Mutant] = []
+    for group in zip(*by_package, strict=False):
+        mutants += group
+    return mutants
+
+
+def _share_found(package: str, verdicts: Sequence[Verdict]) -> str:
+    results: Counter[str] = Counter()
+    for verdict in verdicts:
+        if verdict.mutant.package == package:
+            results[verdict.result] += 1
+    found, unjudged = results["found"], results["unjudged"]
+    share = f"{found} of {found + results['survived']} found"
+    return f"{share}, {unjudged} unjudged" if unjudged else share
+
+
 def main() -> int:
     """Judge mutants of some packages; print the survivors, and the share found in each package."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -244,11 +262,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path, help="file for the verdicts")
     options = parser.parse_args()
-    by_package = [
-        sampled_mutants(package, options.count, options.seed) for package in options.package
-    ]
-    # In turn, so that all packages lose alike if the time is up.
-    mutants = [mutant for group in zip(*by_package, strict=False) for mutant in group]
+    mutants = _mutants_in_turn(options.package, options.count, options.seed)
     with ProcessPoolExecutor(1, FORK) as helper:
         mutants = helper.submit(with_tests, mutants).result()
     prepare(are_many=True)
@@ -260,12 +274,7 @@ def main() -> int:
         sys.stdout.write(f"{verdict.result} {verdict.mutant}\n")
         sys.stdout.flush()
     for package in options.package:
-        results = Counter(
-            verdict.result for verdict in verdicts if verdict.mutant.package == package
-        )
-        judged_count = results["found"] + results["survived"]
-        unjudged = f", {results['unjudged']} unjudged" if results["unjudged"] else ""
-        sys.stdout.write(f"{package}: {results['found']} of {judged_count} found{unjudged}\n")
+        sys.stdout.write(f"{package}: {_share_found(package, verdicts)}\n")
     if options.json:
         rows = [asdict(verdict) for verdict in verdicts]
         options.json.write_text(json.dumps(rows, indent=1), "utf-8")

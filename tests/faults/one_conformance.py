@@ -67,6 +67,6 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", _OF_SERIAL_LINES)
 def test_firmware(name: str, firmware: Path) -> None:
     """It finds none on the firmware, whose playback is its own."""
-    (found,) = judged("serial", [name], far=partial(FirmwareEnd, "serial", firmware))
-    violation = found.reason * (found.result is Result.FAILED)
+    (verdict,) = judged("serial", [name], far=partial(FirmwareEnd, "serial", firmware))
+    violation = verdict.reason * (verdict.result is Result.FAILED)
     assert not violation, violation

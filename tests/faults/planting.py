@@ -133,17 +133,17 @@ class _Matcher:
         if not pattern:
             yield binding, 0
             return
-        first, rest = pattern[0], pattern[1:]
+        first, following = pattern[0], pattern[1:]
         if _is_hole_statement(first):
-            counts = range(len(code) + 1) if rest else [len(code)]
+            counts = range(len(code) + 1) if following else [len(code)]
             for count in counts:
                 with_hole = replace(binding, holes=(*binding.holes, code[:count]))
-                for bound, others in self.match_start(rest, code[count:], with_hole):
-                    yield bound, count + others
+                for bound, following_count in self.match_start(following, code[count:], with_hole):
+                    yield bound, count + following_count
         elif code:
             for bound_first in self.match(first, code[0], binding):
-                for bound, others in self.match_start(rest, code[1:], bound_first):
-                    yield bound, 1 + others
+                for bound, following_count in self.match_start(following, code[1:], bound_first):
+                    yield bound, 1 + following_count
 
     def _match_list(self, pattern: list[Any], code: Any, binding: _Binding) -> Iterator[_Binding]:
         if any(_is_hole_statement(item) for item in pattern):
@@ -167,7 +167,7 @@ class _Matcher:
         if not names:
             yield binding
             return
-        name, *rest = names
+        name, *following = names
         value, in_code = getattr(pattern, name), getattr(code, name)
         is_name = isinstance(value, str) and not isinstance(pattern, ast.Constant)
         if name in ("ctx", "kind", "type_comment"):
@@ -177,7 +177,7 @@ class _Matcher:
         else:
             matched = self.match(value, in_code, binding)
         for bound in matched:
-            yield from self._match_fields(pattern, rest, code, bound)
+            yield from self._match_fields(pattern, following, code, bound)
 
     def _match_call(
         self, pattern: ast.Call, call: ast.Call, binding: _Binding
@@ -187,21 +187,23 @@ class _Matcher:
         named = {keyword.arg for keyword in pattern.keywords}
         same_keywords = [keyword for keyword in call.keywords if keyword.arg in named]
         other_keywords = [keyword for keyword in call.keywords if keyword.arg not in named]
-        others = (call.args[len(first) :], other_keywords)
+        unnamed = (call.args[len(first) :], other_keywords)
         pairs = [(pattern.func, call.func), (first, call.args[: len(first)])]
         for bound in self._match_all(pairs, binding):
-            with_hole = replace(bound, holes=(*bound.holes, others))
+            with_hole = replace(bound, holes=(*bound.holes, unnamed))
             yield from self.match(pattern.keywords, same_keywords, with_hole)
 
     def _match_name(
         self, kind: str, name: str, in_code: str, binding: _Binding
     ) -> Iterator[_Binding]:
-        known = binding.names.get((kind, name))
-        taken = {value for (key, _), value in binding.names.items() if key == kind}
-        if known is not None:
-            if known == in_code:
+        bound_name = binding.names.get((kind, name))
+        bound_names = {value for (key, _), value in binding.names.items() if key == kind}
+        if bound_name is not None:
+            if bound_name == in_code:
                 yield binding
-        elif in_code not in taken and (name == in_code or self._may_differ(kind, name, in_code)):
+        elif in_code not in bound_names and (
+            name == in_code or self._may_differ(kind, name, in_code)
+        ):
             yield replace(binding, names={**binding.names, (kind, name): in_code})
 
     def _may_differ(self, kind: str, name: str, in_code: str) -> bool:
@@ -231,11 +233,11 @@ class _Holes(ast.NodeTransformer):
         return node
 
 
-def _parsed(text: str, what: str) -> list[ast.stmt]:
+def _parsed(text: str, key: str) -> list[ast.stmt]:
     try:
         tree = ast.parse(text)
     except SyntaxError as error:
-        raise StaleEdit(f"`{what}` must be Python, got {error}: {text.strip()}") from None
+        raise StaleEdit(f"`{key}` must be Python, got {error}: {text.strip()}") from None
     statements: list[ast.stmt] = _Holes().visit(tree).body
     return statements
 
@@ -484,8 +486,8 @@ class _Token(NamedTuple):
 
 def tokens(source: str) -> list[_Token]:
     """Return the tokens of C or JavaScript without whitespace and comments."""
-    found = [match for match in _TOKEN.finditer(source) if match["blank"] is None]
-    return [_Token(match[0], match.start(), match.end()) for match in found]
+    matches = [match for match in _TOKEN.finditer(source) if match["blank"] is None]
+    return [_Token(match[0], match.start(), match.end()) for match in matches]
 
 
 def _plant_tokens(edit: Edit, source: str) -> str:

@@ -53,8 +53,8 @@ def private_functions(files: Sequence[Path]) -> Mapping[str, list[Path]]:
 def rename(path: Path, names: Mapping[str, str]) -> None:
     """Rename in one module, in f-strings and docstrings as well."""
     text = path.read_text("utf-8")
-    for name, other in names.items():
-        text = re.sub(rf"\b{name}\b", other, text)
+    for old_name, new_name in names.items():
+        text = re.sub(rf"\b{old_name}\b", new_name, text)
     path.unlink()  # it may be a hard link
     path.write_text(text, "utf-8")
 

@@ -88,9 +88,9 @@ def test_pattern_matches_code_with_other_names_and_layout(
     """In rewritten code one line changes, as described, and has the names of that code."""
     edit = Edit("valve.py", "Valve", find, replacement)
     assert planted(edit, SOURCE) != SOURCE
-    before = ast.unparse(ast.parse(REWRITTEN)).splitlines()
-    after = planted(edit, REWRITTEN).splitlines()
-    changed = [new.strip() for old, new in zip(before, after, strict=True) if old != new]
+    original = ast.unparse(ast.parse(REWRITTEN)).splitlines()
+    mutated = planted(edit, REWRITTEN).splitlines()
+    changed = [new.strip() for old, new in zip(original, mutated, strict=True) if old != new]
     assert changed == [line]
 
 

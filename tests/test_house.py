@@ -25,7 +25,7 @@ def imported(file: Path) -> set[str]:
     names: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            names |= {each.name for each in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names.add(node.module)
     return names
@@ -62,8 +62,8 @@ def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text, "utf-8")
     monkeypatch.setattr(vocabulary, "ROOT", tmp_path)
-    found = [each.partition(", use")[0] for each in retired_identifiers()]
-    assert found == ["examples/one.py:1: begin", "README.md:5: begin"]
+    named = [message.partition(", use")[0] for message in retired_identifiers()]
+    assert named == ["examples/one.py:1: begin", "README.md:5: begin"]
 
 
 FOREIGN = {
@@ -108,12 +108,12 @@ def test_foreign_sentences_are_found_at_their_lines(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text, "utf-8")
     prose = english.read(tmp_path, allowed=["asked"])
-    found = {
+    findings_of_files = {
         name: [(finding.line, finding.pattern) for finding in part.findings]
         for name, part in prose.items()
         if part.findings
     }
-    assert found == {
+    assert findings_of_files == {
         "README.md": [(5, "clause for a noun")],
         "docs/how-to/page.md": [(5, "pronoun for a noun")],
         "examples/rig.yaml": [(2, "nine of ten")],

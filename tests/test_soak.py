@@ -39,7 +39,7 @@ def digest(plan: Plan) -> str:
 @pytest.mark.long
 def test_soak_trace_is_the_same_in_every_process() -> None:
     """Neither hash seeds nor earlier runs change a byte of it; another seed does."""
-    here = digests()
+    digests_here = digests()
     printed = subprocess.run(
         [sys.executable, "-c", "import test_soak; print(test_soak.digests())"],
         env={
@@ -51,8 +51,8 @@ def test_soak_trace_is_the_same_in_every_process() -> None:
         text=True,
         check=True,
     ).stdout
-    assert printed.strip() == str(here)
-    assert digest(replace(held(), seed=4)) not in here.values()
+    assert printed.strip() == str(digests_here)
+    assert digest(replace(held(), seed=4)) not in digests_here.values()
 
 
 def held(
@@ -79,5 +79,5 @@ PLANS = {
 @pytest.mark.parametrize("plan", PLANS)
 def test_soak_plan_breaks_no_rule(plan: str) -> None:
     """Short plans, each of which breaks a rule once a fault of tests/faults is planted."""
-    found, _ = run_plan(PLANS[plan])
-    assert not found, "; ".join(found)
+    violations, _ = run_plan(PLANS[plan])
+    assert not violations, "; ".join(violations)

@@ -38,8 +38,8 @@ DATA = re.compile(
 def build(target: str, root: Path, folder: Path, **environment: str) -> Path:
     """The wheel or the sdist of the sources in root."""
     command = [sys.executable, "-m", "hatchling", "build", "--target", target, "-d", str(folder)]
-    more = {**os.environ, **environment}
-    subprocess.run(command, cwd=root, capture_output=True, check=True, env=more)
+    variables = {**os.environ, **environment}
+    subprocess.run(command, cwd=root, capture_output=True, check=True, env=variables)
     return next(folder.glob("*.whl" if target == "wheel" else "*.tar.gz"))
 
 
@@ -69,7 +69,7 @@ def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
     assert wheel.stem.endswith("-py3-none-any")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    made = {name for name in names if ".dist-info/" in name}
+    metadata = {name for name in names if ".dist-info/" in name}
     recordings = {
         f"controller/data/{name}.tuio" for name in ("touches", "two_people", "three_people")
     }
@@ -80,7 +80,7 @@ def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
         for path in (ROOT / package).rglob("*.*")
         if "__pycache__" not in path.parts and path.suffix != ".so"
     }
-    assert names - made == sources | lent
+    assert names - metadata == sources | lent
     assert [name for name in sources if not DATA.search(name)] == []
     assert {f"{package}/py.typed" for package in PACKAGES} <= names
     assert {
@@ -88,7 +88,7 @@ def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
         "controller/gateway/page/app.js",
         "controller/gateway/page/style.css",
     } <= names
-    assert {name.partition(".dist-info/")[2] for name in made} == {
+    assert {name.partition(".dist-info/")[2] for name in metadata} == {
         "METADATA",
         "RECORD",
         "WHEEL",
@@ -236,9 +236,9 @@ def test_every_dependency_has_a_bound_that_can_be_tried(wheel: Path) -> None:
     """`make smoke-lowest` pins each to its bound; every one of the plain wheel has one."""
     pinned = {line.partition("==")[0] for line in lowest(wheel).split()}
     assert pinned == {
-        one.name
-        for one in requirements(wheel)
-        if one.marker is None or one.marker.evaluate({"extra": "gateway"})
+        requirement.name
+        for requirement in requirements(wheel)
+        if requirement.marker is None or requirement.marker.evaluate({"extra": "gateway"})
     }
 
 
@@ -246,20 +246,21 @@ def test_licences_page_lists_every_dependency(wheel: Path) -> None:
     """Each direct dependency of the wheel and its users' extras; copyleft by its name."""
     page = (ROOT / "docs" / "reference" / "licences.md").read_text(encoding="utf-8")
     items = re.findall(r"^- \*\*(.+?)\*\*: (.+(?:\n  .+)*)", page, re.MULTILINE)
-    told = {
-        re.sub(r"[-_.]+", "-", one.split()[0]).lower(): licence
+    listed = {
+        re.sub(r"[-_.]+", "-", requirement.split()[0]).lower(): licence
         for licence, distributions in items
-        for one in distributions.split(",")
+        for requirement in distributions.split(",")
     }
     users = ("", "gateway", "cluster", "sound")
     needed = {
-        re.sub(r"[-_.]+", "-", one.name).lower()
-        for one in requirements(wheel)
-        if one.marker is None or any(one.marker.evaluate({"extra": extra}) for extra in users)
+        re.sub(r"[-_.]+", "-", requirement.name).lower()
+        for requirement in requirements(wheel)
+        if requirement.marker is None
+        or any(requirement.marker.evaluate({"extra": extra}) for extra in users)
     }
-    assert needed - told.keys() == set()
-    assert {name for name, licence in told.items() if licence == "not stated"} <= NOTES.keys()
-    assert told["python-can"].startswith("LGPL")
+    assert needed - listed.keys() == set()
+    assert {name for name, licence in listed.items() if licence == "not stated"} <= NOTES.keys()
+    assert listed["python-can"].startswith("LGPL")
 
 
 RIG = Path(__file__).parents[1] / "examples" / "paper_plate.yaml"

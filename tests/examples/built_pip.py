@@ -12,8 +12,8 @@ from pathlib import Path
 
 
 def _found(name: str, folder: Path) -> Distribution:
-    (found,) = Distribution.discover(name=name, path=[str(folder)])
-    return found
+    (distribution,) = Distribution.discover(name=name, path=[str(folder)])
+    return distribution
 
 
 def _main(built: Path, site: Path, verb: str, *words: str) -> None:
@@ -24,9 +24,9 @@ def _main(built: Path, site: Path, verb: str, *words: str) -> None:
             shutil.copy(built / file, site / file)
         sys.stdout.write(f"Successfully installed {project['name']}-{project['version']}\n")
     else:
-        there = _found(words[-1], site)
-        version = there.version
-        for file in there.files or []:
+        distribution = _found(words[-1], site)
+        version = distribution.version
+        for file in distribution.files or []:
             (site / file).unlink(missing_ok=True)
         sys.stdout.write(f"  Successfully uninstalled {words[-1]}-{version}\n")
 

@@ -75,7 +75,7 @@ def knots(draw: random.Random) -> Envelope:
     count = draw.choice([0, 1, 2, 5])
     phases = (draw.randint(-18000, 17999) for _ in range(count))
     return Envelope(
-        10 * draw.randint(1, 4), tuple((draw.randint(0, 2000), each) for each in phases)
+        10 * draw.randint(1, 4), tuple((draw.randint(0, 2000), phase) for phase in phases)
     )
 
 
@@ -90,10 +90,10 @@ def command(draw: random.Random, channel: int) -> Command:
 
 def layer(draw: random.Random, number: int, channels: int) -> LayerSet:
     """A layer: commands, silence or a renewal."""
-    numbers = [each for each in range(channels) if draw.random() < 2 / channels]
+    numbers = [channel for channel in range(channels) if draw.random() < 2 / channels]
     if draw.random() < 0.02:
         numbers.append(15)
-    commands = tuple(command(draw, each) for each in dict.fromkeys(numbers))
+    commands = tuple(command(draw, channel) for channel in dict.fromkeys(numbers))
     ramp, valid_for = draw.choice([0, 1, 5, 40]), draw.choice([0, 0, 0, 10, 20, 90])
     is_after = bool(commands) and draw.random() < 0.3
     is_renewal = not commands and draw.random() < 0.5
@@ -139,7 +139,7 @@ class RandomHost:
         numbers = draw.sample(range(self._layers), draw.choice([1, 1, 2, 4]))
         if draw.random() < 0.02:
             numbers.append(self._layers)
-        stream = pack_layers(layer(draw, each, self._channels) for each in numbers)
+        stream = pack_layers(layer(draw, number, self._channels) for number in numbers)
         parts: list[list[int]] = []
         while stream or not parts:
             length = draw.randint(1, 117)
@@ -147,10 +147,14 @@ class RandomHost:
             stream = stream[length:]
         is_now = draw.random() < 0.4
         last = len(parts) - 1
-        others = [each for each in range(last) if draw.random() < 0.97]
+        early_parts = [number for number in range(last) if draw.random() < 0.97]
         if draw.random() < 0.3:
-            draw.shuffle(others)
-        for index in [*others, *draw.choices(range(last + 1), k=draw.choice([0, 0, 0, 2])), last]:
+            draw.shuffle(early_parts)
+        for index in [
+            *early_parts,
+            *draw.choices(range(last + 1), k=draw.choice([0, 0, 0, 2])),
+            last,
+        ]:
             bits = index << 8 | len(parts) << 1 | is_now
             yield 5, [self._session, self._token, bits, *parts[index]]
         if not is_now:
@@ -285,9 +289,9 @@ class Pair:
         self.firmware.receive(SERIAL, data)
         self.amplifier.tick(self.moment)
         self._far.receive(data, self.moment)
-        made, expected = self.firmware.sent(SERIAL), b"".join(self._out)
+        sent, expected = self.firmware.sent(SERIAL), b"".join(self._out)
         self._out.clear()
-        return _of_frames(made), _of_frames(expected)
+        return _of_frames(sent), _of_frames(expected)
 
 
 def _of_frames(data: bytes) -> list[Sent]:

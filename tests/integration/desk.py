@@ -78,8 +78,8 @@ class Desk:
             raise RuntimeError(
                 f"era {' '.join(map(str, arguments))}: status {done.returncode}: {done.stderr}"
             )
-        found: dict[str, Any] = json.loads(done.stdout)
-        return found
+        printed: dict[str, Any] = json.loads(done.stdout)
+        return printed
 
     def touch_plate(self, fingers: Sequence[Place]) -> None:
         """Put fingers on the plate at positions [m]."""
@@ -98,8 +98,8 @@ class Desk:
     @property
     def truth(self) -> dict[str, Any]:
         """What the plate really is."""
-        found: dict[str, Any] = json.loads((self.folder / "truth.json").read_text("utf-8"))
-        return found
+        truth: dict[str, Any] = json.loads((self.folder / "truth.json").read_text("utf-8"))
+        return truth
 
 
 @contextlib.contextmanager
@@ -212,7 +212,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
         rows = list(csv.DictReader(lines))
     places = {row["sensor"]: (float(row["x_m"]), float(row["y_m"])) for row in rows}
     inputs = {row["sensor"]: int(row["input"]) - 1 for row in rows}
-    found = []
+    drawn = []
     with playing(desk, level_db_sl=30) as era, era.armed("desk", lease_s=60):
         server = desk.environment["JACK_DEFAULT_SERVER"]
         capture = Capture(server, "touches", max(inputs.values()) + 1)
@@ -232,7 +232,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
             assert status.predicted_contrast_db is not None
             samples = heard[:, [inputs[name] for name in names]]
             target_size, *quiet_sizes = sizes(samples, status, capture.rate)
-            found.append(
+            drawn.append(
                 Touch(
                     len(names),
                     status.promised_contrast_db,
@@ -241,7 +241,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
                 )
             )
         capture.close()
-    return found
+    return drawn
 
 
 @contextlib.contextmanager

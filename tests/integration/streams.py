@@ -68,13 +68,13 @@ class Stream:
     @property
     def situations(self) -> list[Situation]:
         """Each change with what it asks for: the finger that came last feels it."""
-        found = []
-        before: Mapping[int, str] = {}
+        situations = []
+        former_fingers: Mapping[int, str] = {}
         for (begin, fingers), (end, _) in pairwise(self.changes):
             target = max(fingers, default=None)  # ids are given in order of arrival
-            found.append(Situation(begin, end, fingers, target, not before))
-            before = fingers
-        return found
+            situations.append(Situation(begin, end, fingers, target, not former_fingers))
+            former_fingers = fingers
+        return situations
 
 
 LEVEL_DB_SL = 30.0
@@ -254,5 +254,5 @@ def _phasors(signals: Recording, frequencies: FloatArray) -> ComplexArray:
     weights = np.sqrt(np.hanning(len(signals.times)))[:, None]
     angles = 2 * np.pi * np.outer(signals.times - signals.times[0], frequencies)
     basis = np.hstack([np.sin(angles), np.cos(angles)])
-    found = np.linalg.lstsq(weights * basis, weights * signals.samples, rcond=None)[0]
-    return np.asarray(found[: len(frequencies)] + 1j * found[len(frequencies) :])
+    coefficients = np.linalg.lstsq(weights * basis, weights * signals.samples, rcond=None)[0]
+    return np.asarray(coefficients[: len(frequencies)] + 1j * coefficients[len(frequencies) :])

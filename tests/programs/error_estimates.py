@@ -85,7 +85,7 @@ def layouts() -> list[tuple[str, FloatArray]]:
     rng = np.random.default_rng(2)
     corners = np.array([(0, 0), (1, 0), (0, 1), (1, 1)], dtype=float)
     middles = np.array([(0.5, 0), (0.5, 1), (0, 0.5), (1, 0.5)])
-    found = [
+    placed = [
         ("corners", corners),
         ("corners", corners[:3]),
         ("corners", np.vstack([corners, middles])),
@@ -93,16 +93,16 @@ def layouts() -> list[tuple[str, FloatArray]]:
     ]
     for _ in range(5):
         a, b, c, d = rng.uniform(0.05, 0.95, 4)
-        found.append(("edges", np.array([(a, 0), (b, 1), (0, c), (1, d)])))
-    found += [("near edges", 0.04 + 0.92 * corners), ("near edges", 0.01 + 0.98 * corners)]
-    found += [("inside", rng.uniform(0.08, 0.92, (count, 2))) for count in (4, 4, 4, 4, 4, 8)]
+        placed.append(("edges", np.array([(a, 0), (b, 1), (0, c), (1, d)])))
+    placed += [("near edges", 0.04 + 0.92 * corners), ("near edges", 0.01 + 0.98 * corners)]
+    placed += [("inside", rng.uniform(0.08, 0.92, (count, 2))) for count in (4, 4, 4, 4, 4, 8)]
     for _ in range(2):
         inside = rng.uniform(0.1, 0.9, (2, 2))
         along = [(rng.uniform(0.2, 0.8), 0.0)]
-        found.append(("mixed", np.vstack([corners[1:2], along, inside])))
+        placed.append(("mixed", np.vstack([corners[1:2], along, inside])))
     inside = rng.uniform(0.1, 0.9, (3, 2))
-    found.append(("close together", np.vstack([inside, inside[:1] + 0.02])))
-    return found
+    placed.append(("close together", np.vstack([inside, inside[:1] + 0.02])))
+    return placed
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def judge(case: Case, *, degrees: Sequence[int] = DEGREES, every: int = 1) -> li
     auto = mesh_of("auto", plate, frequency_max=case.highest, stiffness=case.stiffness)
     assert isinstance(auto, SpectralMesh)
     meshes = {added: replace(auto, nx=auto.nx + added, ny=auto.ny + added) for added in degrees}
-    found = []
+    verdicts = []
     for added, mesh in meshes.items():
         free = solve_free_plate(plate, mesh, frequency_max=case.highest)
         for kind, shares in layouts()[::every]:
@@ -143,9 +143,11 @@ def judge(case: Case, *, degrees: Sequence[int] = DEGREES, every: int = 1) -> li
             size = np.linalg.norm(true, axis=2)
             estimate = estimate_error(free, mesh.finer(), eras, frequencies, points) * size
             whole = np.linalg.norm(size)
-            error, estimated = (np.linalg.norm(each) / whole for each in (difference, estimate))
-            found.append(Judged(mesh, added, kind, float(error), float(estimated)))
-    return found
+            error, estimated = (
+                np.linalg.norm(deviation) / whole for deviation in (difference, estimate)
+            )
+            verdicts.append(Judged(mesh, added, kind, float(error), float(estimated)))
+    return verdicts
 
 
 def _eras_at(case: Case, shares: FloatArray) -> list[Era]:
@@ -175,15 +177,15 @@ def _lines() -> Iterator[str]:
     largest, above, count = 0.0, 0, 0
     with Pool(2) as pool:
         for case, judged in zip(CASES, pool.imap(judge, CASES), strict=True):
-            plate, auto = case.plate, [each for each in judged if each.added == 0]
+            plate, auto = case.plate, [verdict for verdict in judged if verdict.added == 0]
             worst = {
-                kinds: 100 * max(each.error for each in auto if each.kind in kinds)
+                kinds: 100 * max(verdict.error for verdict in auto if verdict.kind in kinds)
                 for kinds in _COLUMNS
             }
-            estimates = [100 * each.estimate for each in auto]
-            ratio = max(each.ratio for each in judged)
+            estimates = [100 * verdict.estimate for verdict in auto]
+            ratio = max(verdict.ratio for verdict in judged)
             largest = max(largest, ratio)
-            above += sum(each.error > 0.01 for each in auto)
+            above += sum(verdict.error > 0.01 for verdict in auto)
             count += len(judged)
             sizes = (
                 f"{plate.length:g} x {plate.width:g}, {1e3 * plate.thickness:g}, "

@@ -87,15 +87,15 @@ def answers() -> Answers:
     from kit.plates import contact_sets, smooth_table
     from kit.set_table import only
 
-    found = []
+    results = []
     for quiet in (0, 1, 2, 3, 5):
-        for target, *others in contact_sets(12, fingers=max(2, 1 + quiet), seed=quiet):
+        for target, *quiet_fingers in contact_sets(12, fingers=max(2, 1 + quiet), seed=quiet):
             for drive_mode in ("phased", "switched"):
-                placed = Placement((target,), tuple(others[:quiet]))
+                placed = Placement((target,), tuple(quiet_fingers[:quiet]))
                 layer, felt = only(smooth_table(), placed, 10.0, drive_mode=drive_mode)
                 tones = sorted({tone.frequency for tone in layer.excitation.values()})
-                found.append((tones, felt.promised_contrast_db))
-    return found
+                results.append((tones, felt.promised_contrast_db))
+    return results
 
 
 def blas_in_use() -> set[str]:
@@ -103,14 +103,14 @@ def blas_in_use() -> set[str]:
     import scipy.linalg  # noqa: F401 - which loads its own beside numpy's
 
     mapped = Path("/proc/self/maps").read_text("utf-8").splitlines()
-    found = set()
+    kernels_in_use = set()
     for path in {line.split()[-1] for line in mapped if "openblas" in line}:
         library = CDLL(path)
         (symbol,) = (name for name in _SYMBOLS if hasattr(library, name))
-        asked = library[symbol]
-        asked.restype = c_char_p
-        found.add(asked().decode().lower())
-    return found
+        name_of = library[symbol]
+        name_of.restype = c_char_p
+        kernels_in_use.add(name_of().decode().lower())
+    return kernels_in_use
 
 
 def _say(text: str) -> None:
@@ -137,10 +137,10 @@ def answer_here(expected: str) -> None:
     """Print the answers of this process, if it computes as it should."""
     from model.compiled.kernels import kernels
 
-    own = kernels()
+    loaded = kernels()
     blas, lanes = expected.split(":")
-    if blas_in_use() != {blas.lower()} or own is None or own.lanes != int(lanes):
-        raise SystemExit(f"expected {expected}, got {blas_in_use()} and {own}")
+    if blas_in_use() != {blas.lower()} or loaded is None or loaded.lanes != int(lanes):
+        raise SystemExit(f"expected {expected}, got {blas_in_use()} and {loaded}")
     json.dump(answers(), sys.stdout)
 
 
@@ -152,16 +152,22 @@ def compare(processors: Sequence[Processor]) -> bool:
         with environment_of(processor) as environment:
             command = [sys.executable, __file__, "--here", f"{processor.blas}:{processor.lanes}"]
             done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
-        found = json.loads(done.stdout)
-        first = first or found
-        pairs = list(zip(first, found, strict=True))
-        turned = [number for number, (one, other) in enumerate(pairs) if one[0] != other[0]]
+        results = json.loads(done.stdout)
+        first = first or results
+        pairs = list(zip(first, results, strict=True))
+        turned = [
+            number
+            for number, (expected, computed) in enumerate(pairs)
+            if expected[0] != computed[0]
+        ]
         contrasts = [
-            abs(one[1] - other[1]) for one, other in pairs if None not in (one[1], other[1])
+            abs(expected[1] - computed[1])
+            for expected, computed in pairs
+            if None not in (expected[1], computed[1])
         ]
         is_same &= not turned and max(contrasts) < MAX_CONTRAST
         _say(
-            f"{processor}: {len(found)} answers, {len(turned)} other frequencies {turned or ''}, "
+            f"{processor}: {len(results)} answers, {len(turned)} other frequencies {turned or ''}, "
             f"contrast differs by {max(contrasts):.1e} dB at most"
         )
     return is_same
@@ -196,7 +202,7 @@ def main() -> int:
     for processor in EVERY:
         if lacks := sorted(processor.features - has):
             _say(f"{processor}: not run, this processor lacks {', '.join(lacks)}")
-    is_good = compare([each for each in EVERY if each.features <= has])
+    is_good = compare([processor for processor in EVERY if processor.features <= has])
     for processor in KINDS if not options.answers else ():
         if processor.features <= has:
             is_good &= passes(processor, options.workers)

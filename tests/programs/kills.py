@@ -93,8 +93,8 @@ async def kill_daemons(
     """Kill so many daemons, one after the other, at the same amplifiers; tell: called for each."""
     name, wire, changes = place
     chance = random.Random(seed)
-    with tempfile.TemporaryDirectory(prefix="era-kills-") as made:
-        folder = Path(made)
+    with tempfile.TemporaryDirectory(prefix="era-kills-") as path:
+        folder = Path(path)
         rig = load_rig(write_rig(folder / "bench.yaml", *changes))
         async with far_side(wire, rig) as far:
             journal = Journal(far)
@@ -206,10 +206,10 @@ async def kill_everywhere(
             return await kill_daemons(PLACES[number], shares[number], seed=seed + number, tell=tell)
 
     done = await asyncio.gather(*map(at, range(len(PLACES))), return_exceptions=True)
-    for each in done:  # once all have come to their end
-        if isinstance(each, BaseException):
-            raise each
-    return [kill for each in done for kill in each]
+    for kills in done:  # once all have come to their end
+        if isinstance(kills, BaseException):
+            raise kills
+    return [kill for kills in done for kill in kills]
 
 
 def table(kills: Iterable[Kill]) -> str:
@@ -238,14 +238,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
+    options = parser.parse_args()
     dots = sys.stderr.write if sys.stderr.isatty() else None
 
     def tell(kill: Kill) -> None:
         if dots is not None:
             dots("." if kill.is_good else "!")
 
-    kills = asyncio.run(kill_everywhere(given.kills, seed=given.seed, tell=tell))
+    kills = asyncio.run(kill_everywhere(options.kills, seed=options.seed, tell=tell))
     sys.stdout.write(f"{table(kills)}\n")
     bad = [kill for kill in kills if not kill.is_good]
     for kill in bad:

@@ -60,13 +60,13 @@ class Clicks:
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Target each finger while its click has not ended."""
-        before, self._pulses = self._pulses, {}
+        former_pulses, self._pulses = self._pulses, {}
         targets, ends = [], []
         for contact in contacts:
-            if contact.key not in before and contact.key.id != _RESTING:
+            if contact.key not in former_pulses and contact.key.id != _RESTING:
                 self.pulses.append(Pulse(self._rng.uniform(*_CLICKS), now))
-                before[contact.key] = self.pulses[-1]
-            pulse = self._pulses[contact.key] = before.get(contact.key)
+                former_pulses[contact.key] = self.pulses[-1]
+            pulse = self._pulses[contact.key] = former_pulses.get(contact.key)
             if pulse is None or now < pulse.end:
                 targets.append(Target(contact.key, pulse=pulse))
                 ends.append(math.inf if pulse is None else pulse.end)
@@ -117,11 +117,13 @@ def play(wire: str, amplifiers: int, seed: int, taps: int = PER_CHAIN) -> Counte
                 if outcome.is_confirmed and chain.plate_judge.loudest(name, 1.0, 20) > 0:
                     counts[f"{wire}, {amplifiers}, seed {seed}: {name} is not silent"] += 1
             counts["clicks"] = len(clicks.pulses)
-            counts["played"] = sum(each.started_at is not None for each in clicks.pulses)
+            counts["played"] = sum(pulse.started_at is not None for pulse in clicks.pulses)
             counts["too late"] = chain.controller.cycle.clicks_too_late
             await chain.close()
-            found = chain.plate_judge.violations
-            counts.update(f"{wire}, {amplifiers}, seed {seed}: {one}" for one in found)
+            violations = chain.plate_judge.violations
+            counts.update(
+                f"{wire}, {amplifiers}, seed {seed}: {violation}" for violation in violations
+            )
             return counts
 
     return run_virtual(run(), rng=random.Random(seed + 1))

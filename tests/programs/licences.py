@@ -60,33 +60,35 @@ installation.
 def licence(component: Mapping[str, Any]) -> str:
     """Return the licence of a component, the most specific of several statements."""
     stated = component.get("licenses", [])
-    exact = [each.get("expression") or each["license"].get("id") for each in stated]
-    known = [one for one in exact if one]
-    named = [each["license"]["name"] for each in stated if "license" in each and not known]
-    return " / ".join(known or [name.rpartition(" :: ")[2] for name in named]) or "not stated"
+    exact = [entry.get("expression") or entry["license"].get("id") for entry in stated]
+    expressions = [name for name in exact if name]
+    named = [entry["license"]["name"] for entry in stated if "license" in entry and not expressions]
+    return " / ".join(expressions or [name.rpartition(" :: ")[2] for name in named]) or "not stated"
 
 
 def lists(components: Iterable[Mapping[str, Any]]) -> str:
     """A list by licence: names and versions, the licence of most distributions first."""
-    found: dict[str, list[str]] = {}
-    for one in sorted(components, key=lambda one: one["name"].lower()):
-        found.setdefault(licence(one), []).append(f"{one['name']} {one['version']}")
-    items = sorted(found.items(), key=lambda item: (-len(item[1]), item[0].lower()))
+    names: dict[str, list[str]] = {}
+    for component in sorted(components, key=lambda component: component["name"].lower()):
+        names.setdefault(licence(component), []).append(
+            f"{component['name']} {component['version']}"
+        )
+    items = sorted(names.items(), key=lambda item: (-len(item[1]), item[0].lower()))
     lines = [f"- **{name}**: {', '.join(distributions)}" for name, distributions in items]
     return "\n".join(_WRAPPER.fill(line) for line in lines) + "\n"
 
 
 def page(plain: Mapping[str, Any], extras: Mapping[str, Any]) -> str:
     """The page, of the bill of the plain installation and that with extras."""
-    first = [one for one in plain["components"] if one["name"] != PROJECT]
-    names = {PROJECT, *(one["name"] for one in first)}
-    others = [one for one in extras["components"] if one["name"] not in names]
-    there = {one["name"].lower() for one in [*first, *others]}
-    notes = [f"- {name}: {note}" for name, note in sorted(NOTES.items()) if name in there]
+    first = [component for component in plain["components"] if component["name"] != PROJECT]
+    names = {PROJECT, *(component["name"] for component in first)}
+    extra = [component for component in extras["components"] if component["name"] not in names]
+    all_names = {component["name"].lower() for component in [*first, *extra]}
+    notes = [f"- {name}: {note}" for name, note in sorted(NOTES.items()) if name in all_names]
     return (
         f"{TOP}\n<!-- begin: make licences -->\n\n## Plain installation\n\n{lists(first)}"
         f"\n## Additional packages of the extras `gateway`, `cluster` and `sound`\n\n"
-        f"{lists(others)}\n<!-- end -->\n\n## Missing from the metadata\n\n"
+        f"{lists(extra)}\n<!-- end -->\n\n## Missing from the metadata\n\n"
         + "\n".join(_WRAPPER.fill(note) for note in notes)
         + f"\n{BOTTOM}"
     )
@@ -97,8 +99,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("plain", type=Path)
     parser.add_argument("extras", type=Path)
-    given = parser.parse_args()
-    bills = [json.loads(path.read_text(encoding="utf-8")) for path in (given.plain, given.extras)]
+    options = parser.parse_args()
+    bills = [
+        json.loads(path.read_text(encoding="utf-8")) for path in (options.plain, options.extras)
+    ]
     sys.stdout.write(page(*bills))
     return 0
 

@@ -48,25 +48,25 @@ def reference_figures() -> dict[str, list[float]]:
     problem = DesignProblem(rig, 4, area_of("edge", rig.plate), anywhere(rig.plate))
     layouts = layouts_of("random:8", problem)
     scored = LayoutSearch(problem).scored(list(layouts.values()))
-    figures["layout_scores_db"] = np.array([each.score_db for each in scored])
+    figures["layout_scores_db"] = np.array([value.score_db for value in scored])
     timing = Timing(table)
     for drive_mode in DRIVE_MODES:
         for name, quiet in CONTACTS.items():
             placed = Placement(((0.09, 0.07),), quiet)
             answer = timing.shaped(query(table, placed, drive_mode=drive_mode))
-            felt, more = answer.fingers[0], measures_of(table, answer, timing=timing)
+            felt, contrasts = answer.fingers[0], measures_of(table, answer, timing=timing)
             measures = (
                 felt.contrast_db,
                 answer.layers[0].contrast_to_plate_db,
                 felt.promised_contrast_db,
                 felt.promised_level_db_sl,
-                more.transient_contrast_db,
-                more.residual_db,
+                contrasts.transient_contrast_db,
+                contrasts.residual_db,
             )
             figures[f"query_{drive_mode}_{name}_db"] = np.array(
-                [each for each in measures if each is not None]
+                [value for value in measures if value is not None]
             )
-    return {name: [float(each) for each in values] for name, values in figures.items()}
+    return {name: [float(value) for value in values] for name, values in figures.items()}
 
 
 if __name__ == "__main__":

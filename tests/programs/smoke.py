@@ -120,9 +120,11 @@ class InstalledEra:
 
     def _environment(self) -> dict[str, str]:
         """That of the caller, without what leads to another Python or to the user's own files."""
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+        variables = {
+            name: value for name, value in os.environ.items() if not name.startswith("PYTHON")
+        }
         places = {"XDG_CACHE_HOME": "cache", "XDG_RUNTIME_DIR": "run"}
-        return kept | {name: str(self.folder / place) for name, place in places.items()}
+        return variables | {name: str(self.folder / place) for name, place in places.items()}
 
 
 def try_first(era: InstalledEra) -> None:
@@ -141,8 +143,8 @@ def try_files(era: InstalledEra) -> None:
         expect("good" in era("config", "check", f"{kind}.yaml"), f"the example of a {kind} is bad")
     coarse = ("--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9")
     era("table", "build", "rig.yaml", "-o", "small.npz", *coarse)
-    asked = ("--target", "0.06,0.05", "--quiet", "0.2,0.1")
-    answer = json.loads(era("table", "query", "small.npz", *asked, "--json"))
+    fingers = ("--target", "0.06,0.05", "--quiet", "0.2,0.1")
+    answer = json.loads(era("table", "query", "small.npz", *fingers, "--json"))
     expect(
         answer["fingers"][0]["contrast_db"] > 6.0, f"the two fingers are not told apart: {answer}"
     )
@@ -164,16 +166,16 @@ def try_wire(era: InstalledEra) -> None:
 
 def try_demo(era: InstalledEra) -> None:
     """The demonstration: the recorded touches that come with it are felt as promised."""
-    told = json.loads(era("demo", "--out", "demo", "--json"))
+    demo = json.loads(era("demo", "--out", "demo", "--json"))
     pairs = [
         (touch["promised_contrast_db"], touch["measured_contrast_db"])
-        for touch in told["touches"]
+        for touch in demo["touches"]
         if touch["steady"] and touch["promised_contrast_db"] is not None
     ]
     expect(len(pairs) > 5, "hardly a touch with others on the plate")
-    kept = sum(promised <= felt for promised, felt in pairs)
-    expect(kept >= 0.7 * len(pairs), f"not as promised: {pairs}")
-    expect(all((era.folder / name).is_file() for name in told["files"]), "pictures are missing")
+    count = sum(promised <= felt for promised, felt in pairs)
+    expect(count >= 0.7 * len(pairs), f"not as promised: {pairs}")
+    expect(all((era.folder / name).is_file() for name in demo["files"]), "pictures are missing")
 
 
 def try_gateway(era: InstalledEra) -> None:
@@ -192,23 +194,23 @@ def try_gateway(era: InstalledEra) -> None:
             expect(bool(socket.recv(PATIENCE)), "no WebSocket")
 
 
-def expect(holds: bool, what: str) -> None:
+def expect(holds: bool, problem: str) -> None:
     """Raise Failed unless it holds."""
     if not holds:
-        raise Failed(what)
+        raise Failed(problem)
 
 
 def find_pythons(names: Sequence[str] = PYTHONS) -> dict[str, str]:
     """Programs that are a Python, by their versions; a name without one behind it is left out."""
-    found: dict[str, str] = {}
+    pythons: dict[str, str] = {}
     for name in names:
         program = shutil.which(name)
         if program is None:
             continue
-        said = subprocess.run([program, "-V"], capture_output=True, text=True, check=False)
-        if said.returncode == 0:
-            found[said.stdout.split()[1]] = program
-    return found
+        answer = subprocess.run([program, "-V"], capture_output=True, text=True, check=False)
+        if answer.returncode == 0:
+            pythons[answer.stdout.split()[1]] = program
+    return pythons
 
 
 def requirements(wheel: Path) -> Iterator[Requirement]:
@@ -222,10 +224,14 @@ def requirements(wheel: Path) -> Iterator[Requirement]:
 def lowest(wheel: Path) -> str:
     """Constraints that pin each requirement of the plain wheel and its gateway to its bound."""
     lines = []
-    for one in requirements(wheel):
-        if one.marker is None or one.marker.evaluate({"extra": "gateway"}):
-            bound = next(each.version for each in one.specifier if each.operator == ">=")
-            lines.append(f"{one.name}=={bound}\n")
+    for requirement in requirements(wheel):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": "gateway"}):
+            bound = next(
+                specifier.version
+                for specifier in requirement.specifier
+                if specifier.operator == ">="
+            )
+            lines.append(f"{requirement.name}=={bound}\n")
     return "".join(sorted(lines))
 
 
@@ -241,18 +247,20 @@ def clean_environment(
     return era
 
 
-def _install(era: InstalledEra, what: str) -> None:
+def _install(era: InstalledEra, requirement: str) -> None:
     constraints = str(era.folder.with_name("constraints.txt"))
-    era.module("pip", "--disable-pip-version-check", "install", "-qq", what, "-c", constraints)
+    era.module(
+        "pip", "--disable-pip-version-check", "install", "-qq", requirement, "-c", constraints
+    )
 
 
 def weigh(era: InstalledEra) -> Weight:
     """Its size without pip, which every environment has, and its times."""
     site = Path(era.script("import sysconfig; print(sysconfig.get_path('purelib'))"))
     has = [
-        one.metadata["Name"]
-        for one in importlib.metadata.distributions(path=[str(site)])
-        if one.metadata["Name"] not in ("pip", "setuptools")
+        distribution.metadata["Name"]
+        for distribution in importlib.metadata.distributions(path=[str(site)])
+        if distribution.metadata["Name"] not in ("pip", "setuptools")
     ]
     sizes = {
         folder.name: _size(folder)
@@ -285,8 +293,8 @@ def _median(run: Callable[[], object]) -> float:
 
 def try_out(python: str, wheel: Path, *, constraints: str) -> Weight:
     """Every step in a clean environment of this Python; raises Failed."""
-    with tempfile.TemporaryDirectory(prefix="era-smoke-") as made:
-        era = clean_environment(python, Path(made), wheel, constraints=constraints)
+    with tempfile.TemporaryDirectory(prefix="era-smoke-") as folder:
+        era = clean_environment(python, Path(folder), wheel, constraints=constraints)
         for step in (try_first, try_files, try_wire, try_demo):
             step(era)
         weight = weigh(era)
@@ -301,10 +309,10 @@ def main() -> int:
     parser.add_argument("wheel", type=Path)
     parser.add_argument("--python", nargs="*", default=PYTHONS)
     parser.add_argument("--lowest", action="store_true")
-    given = parser.parse_args()
-    wheel = given.wheel.resolve()
-    constraints = lowest(wheel) if given.lowest else ""
-    pythons = find_pythons(given.python)
+    options = parser.parse_args()
+    wheel = options.wheel.resolve()
+    constraints = lowest(wheel) if options.lowest else ""
+    pythons = find_pythons(options.python)
     failed = not pythons
     sys.stdout.write(f"{HEAD}\n")
     for version, program in pythons.items():
@@ -316,7 +324,7 @@ def main() -> int:
         else:
             sys.stdout.write(f"{row(version, weight)}\n")
             sys.stdout.flush()
-    untried = [name for name in given.python if shutil.which(name) not in pythons.values()]
+    untried = [name for name in options.python if shutil.which(name) not in pythons.values()]
     if untried:
         sys.stderr.write(f"not found, so not tried: {', '.join(untried)}\n")
     return int(failed)

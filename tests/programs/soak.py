@@ -40,14 +40,14 @@ def run_seed(job: tuple[int, bool], wire: str | None = None, plate: str | None =
     return plan, short, *run_plan(plan)
 
 
-def report(found: Iterable[Run], *, minutes: float, again: str) -> int:
+def report(results: Iterable[Run], *, minutes: float, again: str) -> int:
     """Print what comes of runs, the failed ones as they come, for some minutes; exit status."""
     begin = time.perf_counter()
     totals: Counter[str] = Counter()
     runs: Counter[bool] = Counter()
     failed = 0
     virtual = busy = 0.0
-    for plan, short, violations, counts in found:
+    for plan, short, violations, counts in results:
         runs[short] += 1
         virtual += plan.lasts
         busy += plan.busy
@@ -55,7 +55,7 @@ def report(found: Iterable[Run], *, minutes: float, again: str) -> int:
         if violations:
             failed += 1
             options = f"--seed {plan.seed}" + " --short" * short
-            _print(f"seed {plan.seed} failed:", *(f"    {each}" for each in violations))
+            _print(f"seed {plan.seed} failed:", *(f"    {violation}" for violation in violations))
             _print(f"    again: {again} {options} --trace seed-{plan.seed}.txt")
         if runs.total() % _PROGRESS_INTERVAL == 0:
             _print(f"    {runs.total()} seeds, {virtual / 3600:.1f} h, {failed} failed")
@@ -95,8 +95,10 @@ def main() -> int:
     again = "python tests/programs/soak.py" + f" --wire {options.wire}" * bool(options.wire)
     again += f" --plate {options.plate}" * bool(options.plate)
     with get_context("spawn").Pool(options.workers) as pool:
-        found = pool.imap_unordered(partial(run_seed, wire=options.wire, plate=options.plate), jobs)
-        status = report(found, minutes=options.minutes, again=again)
+        results = pool.imap_unordered(
+            partial(run_seed, wire=options.wire, plate=options.plate), jobs
+        )
+        status = report(results, minutes=options.minutes, again=again)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     _print(f"processor time            {used.ru_utime + used.ru_stime:.1f} s")
     _print(f"most memory of a process  {used.ru_maxrss / 1024:.0f} MB")

@@ -115,13 +115,13 @@ def main() -> int:
     """Print the table, or the rows of one folder; return 2 for a folder without any."""
     prefix = sys.argv[1] if len(sys.argv) > 1 else None
     totals = sorted(weights(ROOT).items())
-    shown = [(folder, counts) for folder, counts in totals if _is_shown(folder, prefix)]
-    if not shown:
+    rows = [(folder, counts) for folder, counts in totals if _is_shown(folder, prefix)]
+    if not rows:
         sys.stderr.write(f"folder must be one with Python of the first two levels, got {prefix}\n")
         return 2
     header = f"{'folder':26}{'files':>6}{'lines':>8}{'statements':>12}{'knodes':>8}"
     sys.stdout.write(f"{header}{'expr':>6}{'comp':>6}{'pron':>6}{'words':>8}\n")
-    for folder, counts in shown:
+    for folder, counts in rows:
         sys.stdout.write(f"{row(folder, counts)}\n")
     return 0
 

@@ -24,8 +24,8 @@ def shortly(values: Iterable[Any], short: Collection[Any]) -> list[Any]:
 def in_turn(rows: Iterable[Any], columns: Sequence[Any]) -> list[Any]:
     """All pairs of a row and a column; `make test` takes every row, and the columns in turn."""
     return [
-        (row, column) if column == taken else _long(row, column)
-        for row, taken in zip(rows, cycle(columns), strict=False)
+        (row, column) if column == next_column else _long(row, column)
+        for row, next_column in zip(rows, cycle(columns), strict=False)
         for column in columns
     ]
 
@@ -90,8 +90,8 @@ class _Loader(yaml.CSafeLoader):
 
     def mapping(self, node: yaml.MappingNode) -> Iterator[dict[Any, Any]]:
         """The values by their keys, once all are read."""
-        keys = [each.value for each, _ in node.value]
-        if twice := [each for each, _ in node.value if keys.count(each.value) > 1]:
+        keys = [key.value for key, _ in node.value]
+        if twice := [key for key, _ in node.value if keys.count(key.value) > 1]:
             raise ValueError(f"{twice[-1].value} must stand once, got two{twice[-1].start_mark}")
         return self.construct_yaml_map(node)
 

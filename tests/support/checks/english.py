@@ -237,8 +237,8 @@ def prose_of_python(text: str) -> dict[str, str]:
 
     def position(line: int, column: int) -> int:
         """Return the index of a character, from its line and the bytes before it."""
-        before = lines[line - 1].encode()[:column] if not lines[line - 1].isascii() else None
-        return starts[line - 1] + (column if before is None else len(before.decode()))
+        line_bytes = lines[line - 1].encode()[:column] if not lines[line - 1].isascii() else None
+        return starts[line - 1] + (column if line_bytes is None else len(line_bytes.decode()))
 
     spans: dict[str, list[tuple[int, int]]] = {"texts": [], "docs": []}
     for node, kind in string_nodes(ast.parse(text)):

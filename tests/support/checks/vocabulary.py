@@ -114,7 +114,7 @@ def retired_identifiers() -> Iterator[str]:
         names = {(Path(file).stem, 1)}
         if any(_replacement(name, file) for name in {*_IDENTIFIER.findall(text)}):
             names |= {*_definitions(ast.parse(text))}
-        for name, line in sorted(names, key=lambda each: each[1]):
+        for name, line in sorted(names, key=lambda entry: entry[1]):
             instead = _replacement(name, file)
             if instead is not None:
                 yield f"{file}:{line}: {name}, use {instead}"
@@ -128,9 +128,9 @@ def _programs() -> Iterator[tuple[str, str]]:
     for pattern in PAGES:
         for path in sorted(ROOT.glob(pattern)):
             page = path.read_text("utf-8")
-            for found in _PROGRAM.finditer(page):
-                above = page[: found.start(1)].count("\n")
-                yield path.relative_to(ROOT).as_posix(), "\n" * above + found[1]
+            for fence in _PROGRAM.finditer(page):
+                above = page[: fence.start(1)].count("\n")
+                yield path.relative_to(ROOT).as_posix(), "\n" * above + fence[1]
 
 
 def _definitions(tree: ast.Module) -> Iterator[tuple[str, int]]:

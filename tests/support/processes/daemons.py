@@ -86,8 +86,8 @@ def stated_readings(bench: DaemonBench) -> list[tuple[Number, float]]:
     bench.far.summary()
     stated = bench.far.amplifier.status(bench.far.bench.time)
     return [
-        (each, (stated[each.name] - each.quantity.zero) / each.quantity.per_unit)
-        for each in READINGS
+        (reading, (stated[reading.name] - reading.quantity.zero) / reading.quantity.per_unit)
+        for reading in READINGS
     ]
 
 
@@ -314,7 +314,7 @@ class Asked:
         if self.name != "Set" or self.values["parts"] > 1:
             return self.name == "Set"
         layers = unpack_layers(self.values["stream"])
-        return any(command.is_driven for one in layers for command in one.commands)
+        return any(command.is_driven for layer in layers for command in layer.commands)
 
 
 class Journal:
@@ -371,7 +371,9 @@ def energised(far: FarSide) -> list[str]:
     """The amplifiers that are enabled now, or on their way out of it, or still audible."""
     summaries = {name: far.summary(name) for name in far.devices}
     alive = ("OPERATION_ENABLED", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")
-    return [name for name, one in summaries.items() if one.state in alive or any(one.levels)]
+    return [
+        name for name, summary in summaries.items() if summary.state in alive or any(summary.levels)
+    ]
 
 
 def silent_from(far: FarSide) -> float:
@@ -382,9 +384,9 @@ def silent_from(far: FarSide) -> float:
 def silent_from_of(far: FarSide, name: str) -> float:
     """The same of one amplifier; what has faded is no longer among its tones."""
     far.summary()
-    one = cast(SimulatedAmplifier, far.bench.amplifiers[name])
-    ends = [tone.silent_from for output in one.outputs for tone in output]
-    return max([one.silent_from, *ends])
+    amplifier = cast(SimulatedAmplifier, far.bench.amplifiers[name])
+    ends = [tone.silent_from for output in amplifier.outputs for tone in output]
+    return max([amplifier.silent_from, *ends])
 
 
 def loudness(far: FarSide) -> float:
@@ -458,12 +460,12 @@ async def daemon_process(
         env={**os.environ, **(environment or {})},
     )
     assert process.stderr is not None
-    made = DaemonProcess(process, folder / "era.sock", far)
-    reading = asyncio.create_task(_read_log(process.stderr, made.log))
+    daemon = DaemonProcess(process, folder / "era.sock", far)
+    reading = asyncio.create_task(_read_log(process.stderr, daemon.log))
     try:
         if waits:
-            await made.serves()
-        yield made
+            await daemon.serves()
+        yield daemon
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
@@ -540,7 +542,7 @@ async def playing_daemon(
 
 
 async def plays_on(
-    what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
+    subject: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
 ) -> None:
     """Assert that it stays enabled for a period, and tell the widest gap between signs of life.
 
@@ -552,12 +554,12 @@ async def plays_on(
     while time.monotonic() < begin + seconds:
         assert (await era.status()).state == ENABLED
         await asyncio.sleep(0.05)
-    tell(f"between signs of life, {what}", journal.widest_gap(begin, time.monotonic()))
+    tell(f"between signs of life, {subject}", journal.widest_gap(begin, time.monotonic()))
 
 
-def tell(what: str, seconds: float) -> None:
+def tell(subject: str, seconds: float) -> None:
     """Print a measured time; it is not asserted, for other programs on the machine lengthen it."""
-    sys.stdout.write(f"\nmeasured: {what}: {1e3 * seconds:.1f} ms\n")
+    sys.stdout.write(f"\nmeasured: {subject}: {1e3 * seconds:.1f} ms\n")
 
 
 PROCESS_PATIENCE = 180  # s; for a loaded machine, not an expectation
@@ -734,10 +736,10 @@ class ServedApi:
 
     async def settle(self) -> None:
         """Run the event loop until nothing is left to be served at once, and a little longer."""
-        left = 8
-        while left:
+        turns = 8
+        while turns:
             await asyncio.sleep(0)
-            left = 8 if any(client.has_lines for client in self._clients) else left - 1
+            turns = 8 if any(client.has_lines for client in self._clients) else turns - 1
 
     def _stop_all(self) -> None:
         self.stops += 1

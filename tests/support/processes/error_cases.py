@@ -110,7 +110,7 @@ class Outcome:
 @cache
 def cases() -> tuple[Case, ...]:
     """All cases, in the order of their files."""
-    found: list[Case] = []
+    listed_cases: list[Case] = []
     for path in sorted((ROOT / "tests" / "errors" / "cases").glob("*.yaml")):
         entries: list[dict[str, Any]] = read_yaml(path)
         flat = [
@@ -121,14 +121,14 @@ def cases() -> tuple[Case, ...]:
         for number, case in enumerate(flat, start=1):
             at = case.pop("at", [])
             places = at if isinstance(at, list) else [at]
-            found.append(Case(name=f"{path.stem}-{number}", at=places, **case))
-    return tuple(found)
+            listed_cases.append(Case(name=f"{path.stem}-{number}", at=places, **case))
+    return tuple(listed_cases)
 
 
 def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
     """Run a case in a folder of its own; shelf: holds what is slow to make."""
     _lay_out(case, folder, shelf)
-    before = _files(folder)
+    former_files = _files(folder)
     out, err = io.StringIO(), io.StringIO()
     with _at_home(folder), contextlib.ExitStack() as stack:
         if case.before:
@@ -140,14 +140,14 @@ def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
     text = err.getvalue().replace(str(folder), HOME)
     if case.blur:
         text = re.sub(case.blur, "...", text)
-    changed = frozenset(str(path) for path, _ in before ^ _files(folder))
+    changed = frozenset(str(path) for path, _ in former_files ^ _files(folder))
     return Outcome(text, status, out.getvalue(), changed)
 
 
 def _files(folder: Path) -> set[tuple[Path, bytes]]:
     """The files in a folder but for the cache."""
-    found = (path for path in folder.rglob("*") if path.is_file())
-    within = ((path.relative_to(folder), path) for path in found)
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    within = ((path.relative_to(folder), path) for path in paths)
     return {(name, path.read_bytes()) for name, path in within if name.parts[0] != ".cache"}
 
 
@@ -172,7 +172,7 @@ def _lay_out(case: Case, folder: Path, shelf: Path) -> None:
 @contextlib.contextmanager
 def _at_home(folder: Path) -> Iterator[None]:
     """Make this folder the current one, the home, and that of caches and sockets."""
-    before, environment = Path.cwd(), dict(os.environ)
+    former_folder, environment = Path.cwd(), dict(os.environ)
     os.chdir(folder)
     os.environ.update(
         HOME=str(folder),
@@ -184,7 +184,7 @@ def _at_home(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        os.chdir(before)
+        os.chdir(former_folder)
         os.environ.clear()
         os.environ.update(environment)
 
@@ -271,7 +271,7 @@ def quotations(page: str) -> list[Quotation]:
 
     Blank lines separate the errors of a block.
     """
-    found, status = [], -1
+    quoted, status = [], -1
     for section in page.split("\n## ")[1:]:
         if promised := re.search(r"exit status (\d)", section.splitlines()[0]):
             status = int(promised[1])
@@ -280,16 +280,16 @@ def quotations(page: str) -> list[Quotation]:
                 lines = entry.splitlines()
                 typed = [line for line in lines if _TYPED.match(line)]
                 text = lines[lines.index(typed[-1]) + 1 :]
-                found.append(Quotation(typed, "\n".join(text), status))
-    return found
+                quoted.append(Quotation(typed, "\n".join(text), status))
+    return quoted
 
 
 def with_messages(page: str) -> str:
     """The page with the present message of every error that it quotes."""
-    shown = {tuple(case.typed): case for case in cases() if case.shown}
+    shown_cases = {tuple(case.typed): case for case in cases() if case.shown}
     with tempfile.TemporaryDirectory() as shelf, filled(Path(shelf)):
         for quoted in quotations(page):
-            case = shown[tuple(quoted.typed)]
+            case = shown_cases[tuple(quoted.typed)]
             with tempfile.TemporaryDirectory() as folder:
                 text = provoke(case, Path(folder), Path(shelf)).text.rstrip("\n")
             typed = "\n".join(quoted.typed)

@@ -139,17 +139,19 @@ def _again(path: str, count: str) -> None:
     subscribe = json.dumps(line).encode() + b"\n"
     poll = select.poll()
     connections: dict[int, socket.socket] = {}
-    begin, made = time.monotonic(), 0
+    begin, connection_count = time.monotonic(), 0
     _print("ready")
     while not _is_over():
-        while len(connections) < int(count) and made < 2000 * (time.monotonic() - begin):
+        while len(connections) < int(count) and connection_count < 2000 * (
+            time.monotonic() - begin
+        ):
             connection = _connect(path)
             with contextlib.suppress(OSError):
                 connection.sendall(subscribe)
             connection.setblocking(False)
             connections[connection.fileno()] = connection
             poll.register(connection, select.POLLIN)
-            made += 1
+            connection_count += 1
         for number, _ in poll.poll(1):
             try:
                 is_open = bool(connections[number].recv(1 << 16))
@@ -158,7 +160,7 @@ def _again(path: str, count: str) -> None:
             if not is_open:
                 poll.unregister(number)
                 connections.pop(number).close()
-    _print(f"{made / (time.monotonic() - begin):.0f}")
+    _print(f"{connection_count / (time.monotonic() - begin):.0f}")
 
 
 _KINDS = {

@@ -296,8 +296,8 @@ def gateway_process(
         try:
             line = process.stdout.readline()
             assert line.startswith("dashboard: "), errors.read_text()
-            url, _, own = line.split()[1].partition("#token=")
-            yield GatewayProcess(process, url, errors, token or own)
+            url, _, own_token = line.split()[1].partition("#token=")
+            yield GatewayProcess(process, url, errors, token or own_token)
         finally:
             process.kill()
 
@@ -347,10 +347,10 @@ def real_daemon(
 def wait_for(condition: Callable[[], T], *, timeout: float = PATIENCE) -> T:
     """Wait until a condition holds, and return what it is then; fails after a timeout [s]."""
     end = time.monotonic() + timeout
-    while not (found := condition()):
+    while not (result := condition()):
         assert time.monotonic() < end, "timeout"
         time.sleep(0.01)
-    return found
+    return result
 
 
 def wait_for_state(era: Client, *states: str) -> str:
@@ -389,8 +389,8 @@ def http(
 ) -> HttpResponse:
     """Send a request that would be granted but for the given changes."""
     lines = [f"{method} {target} HTTP/1.1", "Connection: close"]
-    lines += [f"Host: {each}" for each in ([gateway.host] if host is None else host)]
-    lines += [f"Authorization: Bearer {each}" for each in ([TOKEN] if token is None else token)]
+    lines += [f"Host: {value}" for value in ([gateway.host] if host is None else host)]
+    lines += [f"Authorization: Bearer {value}" for value in ([TOKEN] if token is None else token)]
     lines += [] if media is None else [f"Content-Type: {media}"]
     lines += [*more, f"Content-Length: {len(body) if length is None else length}"]
     head = "\r\n".join(lines).encode("latin-1")
@@ -567,19 +567,19 @@ class Page:
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         await self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         async with asyncio.timeout(WAITING):
-            said = await answer
-        if "navigated" in said.get("error", {}).get("message", ""):
+            reply = await answer
+        if "navigated" in reply.get("error", {}).get("message", ""):
             raise Navigated
-        assert "error" not in said, f"{method}: {said['error']}"
-        return dict(said["result"])
+        assert "error" not in reply, f"{method}: {reply['error']}"
+        return dict(reply["result"])
 
     async def evaluate(self, expression: str) -> Any:
         """The value of a JavaScript expression; promises are waited for."""
-        said = await self.call(
+        reply = await self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
-        assert "exceptionDetails" not in said, said["exceptionDetails"]
-        return said["result"].get("value")
+        assert "exceptionDetails" not in reply, reply["exceptionDetails"]
+        return reply["result"].get("value")
 
     async def until(self, expression: str, accepts: Callable[[Any], bool] = bool) -> Any:
         """The value of an expression as soon as it is accepted."""
@@ -664,23 +664,23 @@ class Page:
 
     async def screenshot(self, path: Path) -> None:
         """What is to be seen, as a PNG file."""
-        said = await self.call("Page.captureScreenshot", format="png")
-        path.write_bytes(base64.b64decode(said["data"]))  # noqa: ASYNC240 (nothing else waits)
+        reply = await self.call("Page.captureScreenshot", format="png")
+        path.write_bytes(base64.b64decode(reply["data"]))  # noqa: ASYNC240 (nothing else waits)
 
     async def _listen(self) -> None:
         with contextlib.suppress(websockets.ConnectionClosed):
             async for line in self._socket:
-                said = json.loads(line)
-                if "id" in said:
-                    answer = self._waiting.pop(said["id"])
+                message = json.loads(line)
+                if "id" in message:
+                    answer = self._waiting.pop(message["id"])
                     if not answer.done():
-                        answer.set_result(said)
-                elif said["method"] == "Log.entryAdded":
-                    entry = said["params"]["entry"]
+                        answer.set_result(message)
+                elif message["method"] == "Log.entryAdded":
+                    entry = message["params"]["entry"]
                     if entry["level"] in ("warning", "error"):
                         self.complaints.append(f"{entry['text']} {entry.get('url', '')}")
-                elif said["method"] == "Runtime.exceptionThrown":
-                    self.complaints.append(str(said["params"]["exceptionDetails"]))
+                elif message["method"] == "Runtime.exceptionThrown":
+                    self.complaints.append(str(message["params"]["exceptionDetails"]))
 
 
 class Browser:

@@ -20,8 +20,8 @@ def installed_program(*names: str, package: str = "") -> str:
 
     package: what to install on Debian.
     """
-    found = next(filter(None, map(shutil.which, names)), None)
-    return found or _miss(names[0], package)
+    path = next(filter(None, map(shutil.which, names)), None)
+    return path or _miss(names[0], package)
 
 
 def needs(*names: str) -> None:

@@ -27,14 +27,14 @@ def full_disk(*, at: int = 1024) -> Iterator[None]:
     Python writes no bytecode meanwhile: it would not notice that a file was cut off, and later
     imports of the module would fail.
     """
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    former_limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     without_bytecode = sys.dont_write_bytecode
     sys.dont_write_bytecode = True
-    resource.setrlimit(resource.RLIMIT_FSIZE, (at, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (at, former_limit[1]))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, former_limit)
         sys.dont_write_bytecode = without_bytecode
 
 
@@ -58,11 +58,11 @@ def interrupted(commands: Mapping[str, str], folder: Path) -> dict[str, tuple[in
 
 def _interrupted(command: str, inside: str) -> tuple[int, str]:
     reading, writing = os.pipe()
-    with tempfile.TemporaryFile() as said, Path(os.devnull).open("wb") as out:
+    with tempfile.TemporaryFile() as errors, Path(os.devnull).open("wb") as out:
         pid = os.fork()
         if not pid:
             os.close(reading)
-            os.dup2(said.fileno(), 2)
+            os.dup2(errors.fileno(), 2)
             os.dup2(out.fileno(), 1)
             os._exit(_waiting(command, inside, writing))
         os.close(writing)
@@ -71,8 +71,8 @@ def _interrupted(command: str, inside: str) -> tuple[int, str]:
         if is_there:
             os.kill(pid, signal.SIGINT)
         _, status = os.waitpid(pid, 0)
-        said.seek(0)
-        return os.waitstatus_to_exitcode(status), said.read().decode()
+        errors.seek(0)
+        return os.waitstatus_to_exitcode(status), errors.read().decode()
 
 
 def _waiting(command: str, inside: str, writing: int) -> int:

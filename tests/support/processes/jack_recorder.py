@@ -122,9 +122,9 @@ def record(server: str, name: str, channels: int, kind: str, path: str) -> None:
     client.set_process_callback(process)
     client.activate()
     # A server copies to a monitor only while something is connected to its output.
-    for number, (output, own) in enumerate(zip(outputs, inputs, strict=False), start=1):
+    for number, (output, own_port) in enumerate(zip(outputs, inputs, strict=False), start=1):
         client.connect(output, f"system:playback_{number}")
-        client.connect(f"system:monitor_{number}", own)
+        client.connect(f"system:monitor_{number}", own_port)
     _answer(client.samplerate, client.blocksize)
     for line in sys.stdin:
         name = line.strip()
@@ -133,8 +133,8 @@ def record(server: str, name: str, channels: int, kind: str, path: str) -> None:
             if len(sources) < len(inputs):
                 raise ValueError(f"{name} must have {len(inputs)} outputs, got {len(sources)}")
             # A plate has another output after its sensors: the loop-back.
-            for source, own in zip(sources, inputs, strict=False):
-                client.connect(source, own)
+            for source, own_port in zip(sources, inputs, strict=False):
+                client.connect(source, own_port)
             _answer(len(sources))
         else:
             _answer(len(client.get_all_connections(name)))

@@ -34,8 +34,8 @@ def wait_long(patch: pytest.MonkeyPatch, reply_timeout: float = REPLY_TIMEOUT) -
         patch.setitem(method.__kwdefaults__, "timeout", reply_timeout)  # type: ignore[arg-type]
     for constant in ("set_admission.COMMIT_DELAY", "amplifier.REPLY_TIMEOUT"):
         patch.setattr(f"drivers.host.{constant}", reply_timeout)
-    for made in (Daemon, Controller, Group):
-        patch.setitem(made.__init__.__kwdefaults__, "watchdog", LONG_WATCHDOG)  # type: ignore[arg-type]
+    for patched in (Daemon, Controller, Group):
+        patch.setitem(patched.__init__.__kwdefaults__, "watchdog", LONG_WATCHDOG)  # type: ignore[arg-type]
     arm = Amplifier._arm
 
     async def arm_for_long(

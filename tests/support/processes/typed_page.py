@@ -71,7 +71,7 @@ class Step:
 def read_steps(page: Path) -> list[Step]:
     """What a reader does, in order; raises PageError for a fence or comment without a meaning."""
     steps: list[Step] = []
-    said: dict[str, str] = {}
+    comments: dict[str, str] = {}
     may_print = False  # a fence of text would be what the last step prints
     for token in MarkdownIt().parse(page.read_text(encoding="utf-8")):
         line = token.map[0] + 1 if token.map else 0
@@ -83,36 +83,36 @@ def read_steps(page: Path) -> list[Step]:
                 if key == "interrupt":
                     steps.append(Step(line, "interrupted", name=value))
                 elif key in _OF_A_FENCE:
-                    said[key] = value
+                    comments[key] = value
                 elif key != "begin":  # of a part that is written from the code
                     raise PageError(f"{where}: no comment is called {key!r}")
         elif token.type == "fence":
             kind = token.info.strip()
-            if kind == "text" and may_print and "seen in" not in said:
+            if kind == "text" and may_print and "seen in" not in comments:
                 if steps[-1].kind != "typed" or steps[-1].shown is not None:
                     raise PageError(f"{where}: nothing is typed above this output")
                 steps[-1] = replace(steps[-1], shown=token.content)
                 may_print = False
-            elif "not typed" not in said:
-                step = _step(kind, token.content, said, line=line)
-                if step is None and said:
-                    raise PageError(f"{where}: a fence of {kind!r} cannot be {said}")
+            elif "not typed" not in comments:
+                step = _step(kind, token.content, comments, line=line)
+                if step is None and comments:
+                    raise PageError(f"{where}: a fence of {kind!r} cannot be {comments}")
                 steps += [] if step is None else [step]
                 may_print = step is not None
-            said = {}
+            comments = {}
     return steps
 
 
-def _step(kind: str, text: str, said: dict[str, str], *, line: int) -> Step | None:
+def _step(kind: str, text: str, comments: dict[str, str], *, line: int) -> Step | None:
     if kind == "sh":
-        status = int(said.get("status", "0"))
-        return Step(line, "typed", text, said.get("terminal", ""), status)
-    if kind == "text" and "seen in" in said:
-        return Step(line, "seen", text, said["seen in"])
-    if "file" in said:
-        return Step(line, "written", text, said["file"])
-    if kind == "diff" and "edit" in said:
-        return Step(line, "edited", text, said["edit"])
+        status = int(comments.get("status", "0"))
+        return Step(line, "typed", text, comments.get("terminal", ""), status)
+    if kind == "text" and "seen in" in comments:
+        return Step(line, "seen", text, comments["seen in"])
+    if "file" in comments:
+        return Step(line, "written", text, comments["file"])
+    if kind == "diff" and "edit" in comments:
+        return Step(line, "edited", text, comments["edit"])
     return None
 
 
@@ -124,9 +124,9 @@ _PUNCTUATION = ",;:()[]{}'\"`"
 _SHARE = 0.02
 
 
-def difference(shown: str, printed: str) -> str | None:
+def difference(expected: str, printed: str) -> str | None:
     """Return the first shown line whose facts are not printed where they should be, else None."""
-    wanted = [_facts(line) for line in shown.splitlines()]
+    wanted = [_facts(line) for line in expected.splitlines()]
     lines = [facts for line in printed.splitlines() if (facts := _facts(line))]
     if not any(wanted):
         enough = len(printed.splitlines()) >= len(wanted)
@@ -152,30 +152,30 @@ def difference(shown: str, printed: str) -> str | None:
     instead = " ".join(lines[at]) if at < len(lines) else "the end"
     if number == len(wanted):
         return f"printed beyond what is shown: {instead}"
-    return f"line {number + 1} shown: {shown.splitlines()[number]!r}; printed there: {instead!r}"
+    return f"line {number + 1} shown: {expected.splitlines()[number]!r}; printed there: {instead!r}"
 
 
-def _match(shown: Sequence[str], printed: Sequence[str]) -> bool:
+def _match(wanted: Sequence[str], printed: Sequence[str]) -> bool:
     """Whether the facts of a printed line are those of the shown one."""
-    if not shown:
+    if not wanted:
         return not printed
-    first, *rest = shown
+    first, *following = wanted
     if first == GAP:
-        return any(_match(rest, printed[at:]) for at in range(len(printed) + 1))
-    return bool(printed) and _is_same(first, printed[0]) and _match(rest, printed[1:])
+        return any(_match(following, printed[at:]) for at in range(len(printed) + 1))
+    return bool(printed) and _is_same(first, printed[0]) and _match(following, printed[1:])
 
 
-def _is_same(shown: str, printed: str) -> bool:
-    if _NUMBER.fullmatch(shown) and _NUMBER.fullmatch(printed):
-        return _is_about(shown, printed)
-    return re.fullmatch(".*".join(map(re.escape, shown.split(GAP))), printed) is not None
+def _is_same(wanted: str, printed: str) -> bool:
+    if _NUMBER.fullmatch(wanted) and _NUMBER.fullmatch(printed):
+        return _is_about(wanted, printed)
+    return re.fullmatch(".*".join(map(re.escape, wanted.split(GAP))), printed) is not None
 
 
 def _facts(line: str) -> list[str]:
     tokens = (token.strip(_PUNCTUATION) for token in line.split())
     cut = [token if token.endswith(GAP) else token.removesuffix(".") for token in tokens]
-    known = [GAP if GAP in token and not _is_fact(token) else token for token in cut]
-    return [token for token in known if token == GAP or _is_fact(token)]
+    marked = [GAP if GAP in token and not _is_fact(token) else token for token in cut]
+    return [token for token in marked if token == GAP or _is_fact(token)]
 
 
 def _is_fact(token: str) -> bool:
@@ -183,13 +183,13 @@ def _is_fact(token: str) -> bool:
     return _FACT.search(words) is not None and not _WORDS.fullmatch(token)
 
 
-def _is_about(shown: str, printed: str) -> bool:
-    mantissa, _, exponent = shown.partition("e")
+def _is_about(wanted: str, printed: str) -> bool:
+    mantissa, _, exponent = wanted.partition("e")
     last_digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
-    if "." not in shown and not exponent:
-        last_digit = 0.0 if abs(int(shown)) < 10 else 1.0  # counts are counts
-    allowed = max(1.001 * last_digit, _SHARE * abs(float(shown)))
-    return abs(float(shown) - float(printed)) <= allowed
+    if "." not in wanted and not exponent:
+        last_digit = 0.0 if abs(int(wanted)) < 10 else 1.0  # counts are counts
+    allowed = max(1.001 * last_digit, _SHARE * abs(float(wanted)))
+    return abs(float(wanted) - float(printed)) <= allowed
 
 
 _PROGRESS = re.compile(r"^era: \d+ of \d+ [a-z ]+(, about \d+ (s|min) left)?\n", re.MULTILINE)
@@ -212,12 +212,12 @@ _TERMINAL = re.compile(r"/dev/pts/\d+")
 def free_ports() -> dict[str, str]:
     """Find a free port for every port that pages name."""
     with ExitStack() as held:
-        here = {}
+        numbers = {}
         for port, kind in PORTS.items():
             free = held.enter_context(socket.socket(socket.AF_INET, kind))
             free.bind(("127.0.0.1", 0))
-            here[port] = str(free.getsockname()[1])
-        return here
+            numbers[port] = str(free.getsockname()[1])
+        return numbers
 
 
 class Reader:
@@ -270,8 +270,8 @@ class Reader:
 
     def follow(self, step: Step) -> None:
         """Do one step; raises PageError where anything else comes of it than the page says."""
-        told: dict[str, Any] = {key: self._swapped(value) for key, value in asdict(step).items()}
-        step = replace(step, **told)
+        values: dict[str, Any] = {key: self._swapped(value) for key, value in asdict(step).items()}
+        step = replace(step, **values)
         match step.kind:
             case "written":
                 (self._folder / step.name).write_text(step.text, encoding="utf-8")
@@ -286,17 +286,17 @@ class Reader:
             case _:
                 self._type(step)
 
-    def _swapped(self, told: object) -> object:
-        if isinstance(told, str):
+    def _swapped(self, value: object) -> object:
+        if isinstance(value, str):
             for theirs, ours in self._swaps.items():
-                told = re.sub(rf"(?<![\w.]){theirs}(?!\w)", ours, told)
-        return told
+                value = re.sub(rf"(?<![\w.]){theirs}(?!\w)", ours, value)
+        return value
 
     def _edit(self, step: Step) -> None:
         path = self._folder / step.name
         text, lines = path.read_text(encoding="utf-8"), step.text.splitlines(keepends=True)
-        old = "".join(each[1:] for each in lines if not each.startswith("+"))
-        new = "".join(each[1:] for each in lines if not each.startswith("-"))
+        old = "".join(line[1:] for line in lines if not line.startswith("+"))
+        new = "".join(line[1:] for line in lines if not line.startswith("-"))
         if text.count(old) != 1:
             raise PageError(f"line {step.line}: {text.count(old)} times in {step.name}")
         path.write_text(text.replace(old, new), encoding="utf-8")
@@ -337,15 +337,15 @@ class Reader:
         self._terminals[step.name] = process, output
         self._wait_for(step.line, step.name, step.shown or "")
 
-    def _wait_for(self, line: int, terminal: str, shown: str) -> None:
+    def _wait_for(self, line: int, terminal: str, expected: str) -> None:
         process, output = self._terminals[terminal]
         latest = time.monotonic() + READER_PATIENCE
         # Lines without numbers or names match nothing at all, so the lines are counted too.
-        shown_lines = [line for line in shown.splitlines() if line.strip() not in ("", GAP)]
+        shown_lines = [line for line in expected.splitlines() if line.strip() not in ("", GAP)]
         while True:
             ended = process.poll() is not None or time.monotonic() > latest
             printed = output.read_text(encoding="utf-8")
-            wanted = self._with_its_terminal(shown.rstrip("\n") + "\n...", printed)
+            wanted = self._with_its_terminal(expected.rstrip("\n") + "\n...", printed)
             is_complete = len(printed.splitlines()) >= len(shown_lines)
             if is_complete and difference(wanted, printed) is None:
                 return
@@ -354,16 +354,16 @@ class Reader:
                 raise PageError(f"line {line}: {len(shown_lines)} lines shown, printed:\n{printed}")
             time.sleep(LOOK_AGAIN)
 
-    def _with_its_terminal(self, shown: str, printed: str) -> str:
+    def _with_its_terminal(self, expected: str, printed: str) -> str:
         """What is shown, with the pseudo-terminal that a program has got, from here on known."""
-        theirs, ours = _TERMINAL.search(shown), _TERMINAL.search(printed)
+        theirs, ours = _TERMINAL.search(expected), _TERMINAL.search(printed)
         if theirs is None or ours is None:
-            return shown
+            return expected
         if theirs[0] not in self._swaps:
             # While it is held open, the system does not reuse its name.
             self._held.append(os.open(ours[0], os.O_RDWR | os.O_NOCTTY))
         self._swaps[theirs[0]] = ours[0]
-        return shown.replace(theirs[0], ours[0])
+        return expected.replace(theirs[0], ours[0])
 
     def _interrupt(self, step: Step) -> None:
         process, output = self._terminals[step.name]
@@ -389,6 +389,6 @@ def _commands(fence: str) -> list[list[str]]:
     ]
 
 
-def _compare(line: int, shown: str | None, printed: str) -> None:
-    if shown is not None and (what := difference(shown, printed)) is not None:
-        raise PageError(f"line {line}: {what}\n\n{printed}")
+def _compare(line: int, expected: str | None, printed: str) -> None:
+    if expected is not None and (problem := difference(expected, printed)) is not None:
+        raise PageError(f"line {line}: {problem}\n\n{printed}")

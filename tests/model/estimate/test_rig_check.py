@@ -32,7 +32,6 @@ from kit.plates import (
     random_gains,
     write_rig,
 )
-from tests.model.estimate.thin_plates import FAULTS, draw, measured_fault
 from kit.weekend_boards import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -58,6 +57,7 @@ from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.plate_mesh import SpectralMesh
 from model.structure.plate import Plate
 from model.structure.sources import Era
+from tests.model.estimate.thin_plates import FAULTS, draw, measured_fault
 
 WEEKEND = load_rig(FOLDER / "rig.yaml")
 """The board of the page, grain along its length."""

@@ -1,14 +1,11 @@
 """Presses on a layout in virtual time: real bytes on a wire, a plate in time, what is felt.
 
-The chain has a supervisor, and events of the daemon are steps of its courses. TUIO is as a sender
-makes it, by python-osc: captures of it, and a panel of a daemon.
+TUIO is as a sender makes it, by python-osc: captures of it, and a panel of a daemon.
 """
 
 import asyncio
-import itertools
 import socket
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -21,17 +18,13 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
-from controller.operation.supervisor import Supervisor
 from controller.play.reports import PlayReport
 from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio_capture import RecordedDatagram
-from drivers.errors import LinkError
 from examples.make_touches import tuio_datagram, write_capture
-from kit.chain import Chain, Position, set_chain
+from kit.chain import Chain, Position
 from kit.clock import run_virtual
-from kit.courses import Acted, Planted, Step
 from kit.plates import smooth_rig
 from kit.wires import after_each
 from model.answer.answer import Limits
@@ -219,137 +212,6 @@ class _Starts(Chain):
         self.starts.clear()
         self.applied.clear()
         return felt
-
-
-@dataclass
-class Watched(Acted):
-    """A chain under a running supervisor, and what that has reported.
-
-    failing: of states, links, refusals, alive and cycles that whose observer raises.
-    """
-
-    supervisor: Supervisor = field(init=False)
-    states: list[DaemonState] = field(default_factory=list)
-    links: list[str] = field(default_factory=list)
-    alive: list[float] = field(default_factory=list)
-    cycles: list[float] = field(default_factory=list)
-    failing: str = ""
-
-    @property
-    def state(self) -> DaemonState:
-        """The state of the daemon."""
-        return self.supervisor.operation.state
-
-    @property
-    def is_armed(self) -> bool:
-        """Whether the daemon is, or any amplifier."""
-        return self.state is DaemonState.OPERATION_ENABLED or super().is_armed
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether it never was without a sign of life for more than 0.6 s."""
-        moments = [*self.alive, threads.now()]
-        return max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
-
-    async def take(self, step: Step) -> None:
-        """Take a step, which may be an event in capitals."""
-        if isinstance(step, str) and step.isupper():
-            await self.does(step)
-        else:
-            await super().take(step)
-
-    async def handle(self, event: DaemonEvent) -> None:
-        """Let the supervisor handle an event, and a stop as a client's."""
-        if event.trigger is Trigger.STOP:
-            await self.supervisor.stop(event.cause)
-        else:
-            await self.supervisor.handle(event)
-
-    async def does(self, trigger: str) -> None:
-        """Let the supervisor handle an event of this kind."""
-        await self.handle(DaemonEvent(Trigger[trigger]))
-
-    async def leases(self, seconds: float) -> None:
-        """Arm for a client, for so long."""
-        await self.handle(DaemonEvent(Trigger.ARM, lease=Lease("me", seconds)))
-
-    def renews(self) -> None:
-        """Renew the lease."""
-        assert self.supervisor.operation.lease is not None
-        self.supervisor.renew(self.supervisor.operation.lease)
-
-    async def stops(self, **confirmed: bool) -> None:
-        """Stop all; it is confirmed, or not, that they are silent."""
-        stopped = await self.supervisor.stop("as told")
-        assert {name: each.is_confirmed for name, each in stopped.items()} == confirmed
-
-    def becomes(self, serial_number: str) -> None:
-        """Have another amplifier in place of the first."""
-        self.far_end.amplifier.identity["serial_number"] = serial_number
-        self.far_end.disturb()
-
-    def fails_once(self, method: str) -> None:
-        """Let a method of the controller fail once, while the amplifier is reached."""
-        work, failures = getattr(self.controller, method), [LinkError("as told")]
-
-        async def fail() -> None:
-            if failures:
-                assert self.far_end.is_open
-                raise failures.pop()
-            await work()
-
-        setattr(self.controller, method, fail)
-
-    def energised_in(self, seconds: float, expected: bool) -> None:
-        """Require that amplifiers are taken for energised, or not, in some seconds."""
-        now = threads.now()
-        assert self.supervisor.reopening.assume_energised(now + seconds) is expected
-
-
-@asynccontextmanager
-async def watched(
-    *amplifiers: str,
-    refuses: bool = False,
-    unplugged: bool = False,
-    breaks: str | None = None,
-    **options: Any,
-) -> AsyncIterator[Watched]:
-    """A supervisor with a running control loop, which must end when it is closed.
-
-    amplifiers: one unless more are named; refuses: whether it refuses all requests at first;
-    unplugged: whether the first is not reached then;
-    breaks: the only rules that are broken; options: as for `set_chain`.
-    """
-
-    def heard(name: str, value: object) -> None:
-        if daemon.failing == name:
-            raise Planted(name)
-        getattr(daemon, name).append(value)
-
-    async with set_chain(*amplifiers, of=Watched, **options) as daemon:
-        supervisor = Supervisor(daemon.controller, alive=lambda: heard("alive", threads.now()))
-        supervisor.current.observers.append(lambda old, new: heard("states", new.state))
-        supervisor.link_observers.append(lambda event, lost, message: heard("links", event))
-        daemon.supervisor = supervisor
-        loop = daemon.controller.cycle.observers
-        loop.cycle_completed.append(lambda: heard("cycles", threads.now()))
-        loop.refused.append(lambda reason: heard("refused", reason))
-        if refuses:
-            daemon.refuse("GetCaps")
-        if unplugged:
-            daemon.fault("unplug", of=0)
-        running = asyncio.create_task(supervisor.run())
-        await supervisor.started.wait()
-        await asyncio.sleep(0.005)
-        try:
-            yield daemon
-        finally:
-            daemon.failing = ""
-            daemon.host_rules.commanded("disarm")
-            await supervisor.close("end of the test")
-            await asyncio.wait_for(running, 20)
-            assert not any(each.is_open for each in daemon.far_ends)
-        daemon.judge(breaks)
 
 
 def message(*arguments: Any, address: str = "/tuio/2Dcur") -> Any:

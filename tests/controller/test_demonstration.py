@@ -44,12 +44,23 @@ from registry import threads
 from registry.virtual_time import VirtualTimeLoop
 from sim.faults import FaultWindow
 
-FIGURES = ("contrast_db", "level_db_sl")
-PROMISED = ("promised_contrast_db",)
-KEYS = (
-    *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
-    *("played_s", "steady"),
-)
+KEYS = {
+    "time_s",
+    "until_s",
+    "targets_m",
+    "quiet_m",
+    "reason",
+    "drive",
+    "mode",
+    "latency_ms",
+    "played_s",
+    "steady",
+    "predicted_contrast_db",
+    "predicted_level_db_sl",
+    "promised_contrast_db",
+    "measured_contrast_db",
+    "measured_level_db_sl",
+}
 FINGER = FingerRow(
     at_m=(0.1, 0.1),
     frequency_hz=90.0,
@@ -59,48 +70,56 @@ FINGER = FingerRow(
     measured_level_db_sl=20.0,
 )
 FINGER_KEYS = {
-    *("at_m", "frequency_hz", "verdict"),
-    *("promised_contrast_db", "measured_contrast_db", "measured_level_db_sl"),
+    "at_m",
+    "frequency_hz",
+    "verdict",
+    "promised_contrast_db",
+    "measured_contrast_db",
+    "measured_level_db_sl",
 }
 
 
-def vibration(amplitudes, frequencies=(100.0, 250.0)):
+def vibration(amplitudes: Any, frequencies: tuple[float, ...] = (100.0, 250.0)) -> FingerVibration:
     """A finger with amplitudes (f, p) at its points."""
-    amplitudes = np.array(amplitudes, dtype=float).reshape(len(frequencies), -1)
-    count = amplitudes.shape[1]
+    at_points = np.array(amplitudes, dtype=float).reshape(len(frequencies), -1)
+    count = at_points.shape[1]
     weights = np.full(count, 1 / count)
-    return FingerVibration(np.array(frequencies), amplitudes, weights)
+    return FingerVibration(np.array(frequencies), at_points, weights)
 
 
-def row(time, *, contrast, others):
+def row(time: float, *, contrast: float | None, quiet_fingers: int) -> TouchRow:
     """A measured touch with other fingers on the plate."""
     return TouchRow(
         target_id="t",
         time_s=time,
         until_s=time + 1,
         targets_m=[(0.05, 0.05), (0.2, 0.1)],
-        quiet={f"q{n}": (0.1, 0.01 * n) for n in range(others)},
+        quiet={f"q{n}": (0.1, 0.01 * n) for n in range(quiet_fingers)},
         measured_level_db_sl=19.0,
         measured_contrast_db=contrast,
     )
 
 
-def test_felt_contrast_relates_levels_not_accelerations():
+def test_felt_contrast_relates_levels_not_accelerations() -> None:
     """Ten times threshold at 100 Hz against the same acceleration at 250 Hz: their thresholds'.
 
     Both tones together are felt as the square root of the sum of squares.
     """
     low, high = detection_threshold(np.array([100.0, 250.0]))
-    target, quiet = vibration([[10 * low], [0.0]]), vibration([[0.0], [10 * low]])
-    assert steady_contrast_db(target, [quiet]) == pytest.approx(20 * np.log10(high / low))
-    assert steady_contrast_db(target, []) is None
+    target = vibration([[10 * low], [0.0]])
+    quiet = vibration([[0.0], [10 * low]])
     mixed = vibration([[3 * low, 0.0], [4 * high, 0.0]])
-    assert steady_contrast_db(target, [mixed, quiet]) == pytest.approx(
-        20 - 20 * np.log10(max(5, 10 * low / high))
-    )
+
+    contrast = steady_contrast_db(target, [quiet])
+    lower_contrast = steady_contrast_db(target, [mixed, quiet])
+
+    assert contrast == pytest.approx(20 * np.log10(high / low))
+    loudest = max(5, 10 * low / high)
+    assert lower_contrast == pytest.approx(20 - 20 * np.log10(loudest))
+    assert steady_contrast_db(target, []) is None
 
 
-def test_felt_contrast_is_the_least_over_the_threshold_sets():
+def test_felt_contrast_is_the_least_over_the_threshold_sets() -> None:
     """A target at 250 Hz beside 100 Hz, each at the same level by the first set.
 
     By hand, of the thresholds on the page about people: by the second set the target is higher by
@@ -114,52 +133,56 @@ def test_felt_contrast_is_the_least_over_the_threshold_sets():
     assert steady_contrast_db(target, [single]) == pytest.approx(-3.0, abs=0.2)
 
 
-def test_contents_are_told_apart_by_their_frequencies():
+def test_contents_are_told_apart_by_their_frequencies() -> None:
     """By hand: 10 times threshold of its own, 0.3 and 0.4 of others: 26 dB above their power."""
     thresholds = detection_threshold(np.array([90.0, 170.0, 260.0]))
     felt = vibration(np.diag(thresholds) @ [[10.0], [0.3], [0.4]], (90.0, 170.02, 260.0))
+
     content, foreign = felt.parted(90.0)
+    silence, remainder = felt.parted(500.0)
+
     assert content.level_db_sl == pytest.approx(20.0)
     assert steady_contrast_db(content, [foreign]) == pytest.approx(20 + 6.02, abs=0.01)
-    silence, all_others = felt.parted(500.0)
     assert silence.level_db_sl == -np.inf
-    assert all_others.level_db_sl == pytest.approx(felt.level_db_sl)
+    assert remainder.level_db_sl == pytest.approx(felt.level_db_sl)
 
 
-def test_promise_is_kept_by_at_least_the_promised_contrast():
+def test_promise_is_kept_by_at_least_the_promised_contrast() -> None:
     """Only steady touches with a promise and a measurement count."""
-    promised = replace(row(1.0, contrast=12.0, others=1), steady=True, promised_contrast_db=12.0)
+    promised = replace(
+        row(1.0, contrast=12.0, quiet_fingers=1), steady=True, promised_contrast_db=12.0
+    )
     assert promised.keeps_promise
     assert replace(promised, measured_contrast_db=11.9).keeps_promise is False
-    for unknown in (
-        {"steady": False},
-        {"promised_contrast_db": None},
-        {"measured_contrast_db": None},
-    ):
-        assert replace(promised, **unknown).keeps_promise is None
+    assert replace(promised, steady=False).keeps_promise is None
+    assert replace(promised, promised_contrast_db=None).keeps_promise is None
+    assert replace(promised, measured_contrast_db=None).keeps_promise is None
 
 
-def test_json_has_the_documented_keys_of_every_touch():
+def test_json_has_the_documented_keys_of_every_touch() -> None:
     """Also of one that was not driven: without figures, but with the reason."""
-    silent = replace(row(1.0, contrast=None, others=1), reason="too close")
-    figures = {f"{kind}_{of}" for kind in ("predicted", "measured") for of in FIGURES}
-    assert silent.as_json().keys() == {*figures, *PROMISED, *KEYS}
-    assert silent.as_json()["quiet_m"] == [(0.1, 0.0)]
+    silent = replace(row(1.0, contrast=None, quiet_fingers=1), reason="too close")
     shared = replace(silent, fingers=[FINGER])
-    assert shared.as_json().keys() - silent.as_json().keys() == {"fingers"}
-    (finger,) = shared.as_json()["fingers"]
+
+    values = silent.as_json()
+    values_of_shared = shared.as_json()
+
+    assert values.keys() == KEYS
+    assert values["quiet_m"] == [(0.1, 0.0)]
+    assert values_of_shared.keys() == KEYS | {"fingers"}
+    (finger,) = values_of_shared["fingers"]
     assert finger.keys() == FINGER_KEYS
 
 
 ROWS = (
-    replace(row(0.26, contrast=None, others=0), targets_m=[(0.198, 0.0594)], steady=True),
-    replace(row(1.0, contrast=14.0, others=2), promised_contrast_db=12.25, steady=True),
-    replace(row(1.5, contrast=11.0, others=1), promised_contrast_db=12.0, steady=True),
-    replace(row(2.0, contrast=None, others=1), reason="too close"),
-    replace(row(3.0, contrast=None, others=1), measured_level_db_sl=None, played_s=0.214),
-    replace(row(4.0, contrast=9.0, others=1), promised_contrast_db=8.0),
+    replace(row(0.26, contrast=None, quiet_fingers=0), targets_m=[(0.198, 0.0594)], steady=True),
+    replace(row(1.0, contrast=14.0, quiet_fingers=2), promised_contrast_db=12.25, steady=True),
+    replace(row(1.5, contrast=11.0, quiet_fingers=1), promised_contrast_db=12.0, steady=True),
+    replace(row(2.0, contrast=None, quiet_fingers=1), reason="too close"),
+    replace(row(3.0, contrast=None, quiet_fingers=1), measured_level_db_sl=None, played_s=0.214),
+    replace(row(4.0, contrast=9.0, quiet_fingers=1), promised_contrast_db=8.0),
     replace(
-        row(12.0, contrast=14.0, others=0),
+        row(12.0, contrast=14.0, quiet_fingers=0),
         targets_m=[(0.1, 0.1)],
         fingers=[FINGER, replace(FINGER, at_m=(0.2, 0.1), verdict="mixed")],
         contents=(None, None),

@@ -38,7 +38,6 @@ from processes.daemons import (
     far_end,
     next_event,
     ready_daemon,
-    request,
     running_daemon,
     until_state,
 )
@@ -184,18 +183,6 @@ async def test_events_that_a_client_is_too_slow_for_are_counted(tmp_path: Path) 
         assert len(events) == MAX_QUEUED_EVENTS
         assert len(events) + sum(received.lost for received in events) == 3001
         assert 0 < (await observer.status()).lost_events["log"] < 1000
-
-
-async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Path) -> None:
-    """The present state, of which nothing is missed."""
-    async with ready_daemon(tmp_path) as (bench, _):
-        reader, writer = await asyncio.open_unix_connection(bench.socket)
-        with contextlib.closing(writer):
-            writer.write(request("hello", '{"client":"a"}', id=1))
-            writer.write(request("subscribe", '{"topics":["state"]}', id=2))
-            lines = [json.loads(await reader.readline()) for _ in range(3)]
-        assert [message.get("id") for message in lines] == [1, 2, None]
-        assert lines[2]["params"]["data"]["new"] == READY
 
 
 async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,13 +44,13 @@ from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.canopen_objects import ObjectServer, SdoAbort
 
 STATED = {"older": {"later_voltage": None}, "same": {"later_voltage": WORD}, "newer": {}}
-"""Of what is added, by the age of the amplifier."""
+"""The added readings that an amplifier of each age states."""
 
 
 @pytest.mark.parametrize("wire", KINDS)
 @in_virtual_time
 async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) -> None:
-    """It plays and stops; what is not stated is None, what is not known is ignored."""
+    """It plays and stops; a reading that it lacks is None, and an unknown word is ignored."""
     end = MemoryLine(wire, "a")
     group = await group_of(end)
     await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]})
@@ -66,20 +66,20 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
 
 _FIRST = frozenset(STATUS_RECORD.names)
 _UNSTATED = [0] * sum(entry.words for entry in STATUS_RECORD.added)
-"""What the table has added, of an amplifier that states only what is later than the table."""
+"""Words of the added readings of an amplifier that states only newer ones."""
 _OLDER = 11 + 4 + 8 + len(_UNSTATED)
 """Words of 4 channels and 8 layers."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_conformance_takes_another_edition(kind: str, age: str) -> None:
-    """Words behind those that are known, or fewer, break no rule."""
+    """Additional words, or fewer words, break no rule."""
     checks = "capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths"
     assert {result.result for result in judged(kind, checks)} == {"passed"}
 
 
 def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
-    """Those of 4 channels and 8 layers, and the one that is added under the next subindex."""
+    """The objects of 4 channels and 8 layers, and the added one under the next subindex."""
     objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
     if age == "older":
         assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER]), (
@@ -94,7 +94,7 @@ def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
 
 @pytest.mark.parametrize("age", ["same"], indirect=True)
 def test_pages_and_files_have_what_is_added(age: str) -> None:
-    """At the end of its row, of the sheet, and of what the firmware sends."""
+    """It is last in its row, in the sheet and in the firmware's status."""
     assert " · later_voltage (added) |" in records()
     assert f"[2002sub{_OLDER + 1:X}]\nParameterName=later_voltage\n" in eds_text()
     readings, _, put = records_header().partition("put_status(")
@@ -115,7 +115,7 @@ def test_reading_that_is_added_may_be_zero_or_less(word: int, volts: float | Non
 
 
 def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
-    """Two are added, the first of two words; nothing behind them is looked at."""
+    """Two readings are added, the first of two words; later words are ignored."""
     code = Number("code", QUANTITIES["code"])
     long = Number("long", WireQuantity("long", "u32", 1, "", 1, 1 << 31), is_added=True)
     record = Record(code, long, LATER)
@@ -136,7 +136,7 @@ def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
 
 
 def test_places_of_words_are_those_of_the_page() -> None:
-    """Of protocol.md: eleven words before the levels, three before the stream of a set."""
+    """Eleven words precede the levels, three the stream of a set (protocol.md)."""
     assert (
         STATUS_RECORD.places["token"],
         STATUS_RECORD.places["layers"],
@@ -149,7 +149,7 @@ def test_places_of_words_are_those_of_the_page() -> None:
 
 
 def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
-    """A line each, only while the context lasts; a frame that cannot be decoded is shown too."""
+    """One line for each frame within the context, also for a frame that cannot be decoded."""
     path = tmp_path / "trace.txt"
     trace.frame(Direction.OUT, b"\x01", "before", lambda: "before")
     with tracing(path):
@@ -161,17 +161,16 @@ def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
     trace.frame(Direction.OUT, b"\x01", "after", lambda: "after")
     lines = path.read_text("utf-8").splitlines()
     time = re.compile(r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}\+00:00 ")
-    assert all(time.match(line) for line in lines)
-    assert [time.sub("", line) for line in lines] == [
-        "wire serial:///dev/x > 2c 01  Ping()",
-        "wire serial:///dev/x < ff  not decoded: no such type",
-        "request Ping() -> 'Status' in 12.3 ms",
+    assert [time.sub("<time> ", line) for line in lines] == [
+        "<time> wire serial:///dev/x > 2c 01  Ping()",
+        "<time> wire serial:///dev/x < ff  not decoded: no such type",
+        "<time> request Ping() -> 'Status' in 12.3 ms",
     ]
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
 def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The caller never waits; the number of dropped records stands in the file."""
+    """The caller never waits; the file ends with the number of dropped records."""
     monkeypatch.setattr(trace, "MAX_PENDING_RECORDS", 10)
     file, may_go_on, is_writing = Mock(), threading.Event(), threading.Event()
     file.write.side_effect = lambda text: is_writing.set() or may_go_on.wait(60)
@@ -189,7 +188,7 @@ def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_full_disk_ends_only_the_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No exception of its thread, which would be printed over the result of a command."""
+    """Its thread raises no exception, which would be printed over the result of a command."""
     raised: list[object] = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
     with full_disk(), tracing(tmp_path / "trace.txt"):
@@ -199,7 +198,7 @@ def test_full_disk_ends_only_the_trace(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("kind", ["fifo", "directory", "missing folder"])
 def test_unusable_trace_file_is_refused(tmp_path: Path, kind: str) -> None:
-    """At once, also a FIFO that nothing reads."""
+    """Immediately, even a FIFO that no process reads."""
     path = tmp_path / "trace"
     if kind == "fifo":
         os.mkfifo(path)
@@ -274,7 +273,7 @@ STREAM = [
         ([0x1000, 20, 500], "BAD_VALUE", None),
         ([0x0001, 20, 500, 0x0000, 2200, 10001, 0], "BAD_VALUE", 0),
         ([0x0001, 20, 500, 0x0052, 2200, 1, 0, 33, 50, *(0, 0) * 33], "BAD_VALUE", 5),
-        # Of two flaws that which comes first: length, layer, channel, then the channel's words.
+        # The first of two flaws counts: length, layer, channel, then the channel's words.
         ([0x0001, 1001, 500, 0x0010, 2200, 0, 0, 9], "BAD_VALUE", None),
         ([0x0001, 1001, 500, 0x0012, 2200, 0, 0, 1, 50, 0], "BAD_LENGTH", None),
         ([0x0001, 20, 500, 0x0010, 2200, 0, 18000, 0x0000, 1001, 0], "BAD_VALUE", 1),
@@ -310,7 +309,7 @@ def test_set_is_whole_whatever_the_order_of_its_parts() -> None:
 
 
 def test_parts_of_another_set_or_too_late_are_not_mixed() -> None:
-    """Another token drops what was collected, and so does the time that a set may take."""
+    """Another token, or the maximum duration of a set, discards the collected parts."""
     old, new = (parts([token] * 300, session=9, token=token, now=False) for token in (1, 2))
     assembly = Assembly()
     assert assembly.keep(old[0], 0.0)
@@ -325,7 +324,7 @@ def test_parts_of_another_set_or_too_late_are_not_mixed() -> None:
 
 
 def test_damaged_streams_are_read_or_refused() -> None:
-    """Words exchanged at random raise a refusal at most, and what is read packs to itself."""
+    """Random words are refused, or decoded to layers that encode to the same words."""
     chance = random.Random(3)
     read = 0
     for _ in range(5_000):
@@ -379,7 +378,7 @@ def test_long_numbers_and_texts_have_the_high_part_first() -> None:
 
 
 def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> None:
-    """Of 0.05 rpm two; a unit without a name for keys and metrics is refused."""
+    """Steps of 0.05 rpm have two decimals; a unit without a name for keys is an error."""
     speed = Number("fan_speed", WireQuantity("fan_speed", "u16", 20, "rpm", 1, 65535))
     assert (speed.key, speed.metric, speed.label) == (*("fan_speed_rpm",) * 2, "fan speed")
     assert (speed.decimals, Number("count", QUANTITIES["count"]).decimals) == (2, 0)
@@ -411,7 +410,7 @@ def test_added_reading_that_fills_a_word_is_refused(low: int, high: int) -> None
     ],
 )
 def test_request_that_no_host_may_send_is_refused(name: str, words: list[int], code: str) -> None:
-    """Too short, too long and out of range, each by its own code."""
+    """Too short, too long or out of range: each has its own code."""
     with pytest.raises(Refusal) as caught:
         MESSAGES[name].request.unpack(words, is_strict=True)
     assert caught.value.code == code
@@ -435,7 +434,7 @@ def test_longest_messages_fit_every_wire() -> None:
 
 
 def test_random_words_are_read_or_refused() -> None:
-    """Whatever arrives, nothing else than a refusal is raised, and what is read packs to itself."""
+    """Random words are refused, or decoded to values that encode to the same words."""
     random_words = random.Random(5)
     read = 0
     for _ in range(5_000):

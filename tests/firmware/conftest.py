@@ -1,4 +1,4 @@
-"""The firmware's programs, each built once where a test needs it."""
+"""The firmware's programs, each built once if a test needs it."""
 
 import os
 from collections.abc import Callable
@@ -13,20 +13,20 @@ from tests.firmware.firmware_machine import build_firmware
 
 @pytest.fixture(scope="session")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of its programs; skipped where there is nothing to build them with."""
+    """Return the folder of its programs; skip without a compiler."""
     needs("cc", "make")
     return tmp_path_factory.mktemp("firmware")
 
 
 @pytest.fixture(scope="session")
 def firmware(compiled: Path) -> Path:
-    """That folder, with the amplifier."""
+    """Return that folder with the amplifier."""
     return build_firmware(compiled, "era-firmware")
 
 
 @pytest.fixture(scope="session")
 def moved(compiled: Path) -> Callable[..., Path]:
-    """The folder of the library on a moved clock, built with options of the compiler."""
+    """Return a function that builds the library on a moved clock with compiler options."""
 
     @cache
     def build(*options: str) -> Path:
@@ -42,5 +42,5 @@ def moved(compiled: Path) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def replaying(moved: Callable[..., Path]) -> Path:
-    """That folder, of the firmware as it is."""
+    """Return the folder of the library with the default options."""
     return moved()

@@ -257,7 +257,7 @@ def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., 
     """Its status stays valid, and a set plays for every 500 damaged frames at least.
 
     30 to 50 damaged frames for each set are usual if a request is one frame. On CAN a request is
-    five frames, so nearly none of those that may be damaged is whole.
+    five frames, so that nearly every request that may be damaged is damaged.
     """
     chance = random.Random(wire)
     firmware = MovedFirmware(moved())
@@ -316,8 +316,8 @@ async def opened(url: str) -> AsyncIterator[Amplifier]:
 
 @pytest.mark.real_time
 @pytest.mark.parametrize("name", MASTERS)
-def test_foreign_master_drives_it(name: str, firmware: Path) -> None:
-    """Reads by both functions, writes, a set, and an exception; none of the host takes part."""
+def test_foreign_modbus_master_drives_the_firmware(name: str, firmware: Path) -> None:
+    """Both read functions, writes, a set and an exception, without code of the host."""
     line, make = MASTERS[name]
     with running_firmware(firmware, *options(f"--modbus-{line}")) as (url, _):
         assert drive(make, url) == "ERA haptics"
@@ -329,7 +329,7 @@ def test_foreign_master_drives_it(name: str, firmware: Path) -> None:
 async def test_address_is_taken_and_kept_without_supply(
     line: str, firmware: Path, tmp_path: Path
 ) -> None:
-    """It replies there after a restart; not to the name of another, and not while armed."""
+    """It replies there after a restart; it refuses while armed, and with another serial number."""
     addresses = tmp_path / "addresses"
     with running_firmware(firmware, *options(line, "--addresses", str(addresses))) as (url, _):
         async with opened(url) as amplifier:
@@ -358,7 +358,7 @@ async def move(amplifier: Amplifier, serial_number: str) -> Values:
 @pytest.mark.real_time
 @pytest.mark.usefixtures("unhurried")
 async def test_open_interlock_is_a_fault_until_it_is_closed(firmware: Path) -> None:
-    """It silences an armed amplifier, keeps it from being armed, and is cleared once closed."""
+    """It silences an armed amplifier, prevents arming, and can be cleared once closed."""
     with running_firmware(firmware, "--serial") as (url, process):
         async with opened(url) as amplifier:
             await amplifier.arm(7, 2.0)
@@ -557,7 +557,7 @@ def square_law(moved: Callable[..., Path]) -> Path:
 def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Path) -> None:
     """With the square law two tones that cross-fade have neither harmonics nor beats.
 
-    The square of a sample is half the full force plus half of what the same script plays as forces.
+    The square of a sample is half the full force plus half the force of the same script.
     """
     script: Script = [
         (0, arm()),
@@ -584,7 +584,7 @@ def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Pat
 def test_bias_is_there_only_under_high_voltage(
     square_law: Path, watchdog_ms: int, last: tuple[int, bytes]
 ) -> None:
-    """No voltage before Arm, nor once it has fallen silent; between them the bias."""
+    """No voltage before Arm and once it is silent again; the bias in between."""
     script: Script = [(10, arm(watchdog_ms)), (20, apply(1, command(0, 100, 0.9))), last]
     voltages, _ = replay(square_law, script, 200)
     assert not voltages[: 10 * PER_MS].any()
@@ -617,7 +617,7 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     """A watchdog of 0.25 s and a stall of 1.2 s, with and without samples meanwhile.
 
     The watchdog is real time: samples that were due end 0.255 s after it was fed, and where the
-    converter stood still no more than 5 ms are made.
+    converter stood still at most 5 ms are made.
     """
     firmware = MovedFirmware(replaying)
     firmware.receive(SERIAL, arm(250))
@@ -650,7 +650,7 @@ def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
 
 
 def test_high_voltage_is_measured_as_soon_as_it_is_switched(replaying: Path) -> None:
-    """Read every 0.1 ms amid a Disarm along 5 ms: never 1800 V beside a flag that says off."""
+    """Read every 0.1 ms during a Disarm of 5 ms: 1800 V never occur with the flag off."""
     firmware = MovedFirmware(replaying)
     firmware.receive(SERIAL, arm())
     firmware.receive(SERIAL, apply(1, command(0, 100, 0.5)))

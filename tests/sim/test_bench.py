@@ -1,4 +1,4 @@
-"""A whole rig in numbers, on a virtual clock: from a request to what a finger feels.
+"""A whole simulated rig on a virtual clock: from a request to the vibration at a finger.
 
 What voices do to the plate follows the clock of their amplifier, with its law, crystal and rate.
 """
@@ -51,7 +51,7 @@ def phases(bench: Bench, times: tuple[float, ...], *frequencies: float) -> np.nd
 
 
 def test_angle_is_the_frequency_word_times_the_clock(two_amplifiers: Rig) -> None:
-    """In whole numbers, over the end of a turn and hours later, whenever the voice has begun."""
+    """In integers, across the end of a turn and hours later, for any start of the voice."""
     clock = AmplifierClock(Crystal(error=30e-6, ahead=11.0))
     clock.steer(-123, 40.0)
     for time in (41.3, 48.9999, 49.0001, 20_000.7):
@@ -119,7 +119,7 @@ START = 98765.4321  # as large as a clock may be
 
 
 def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
-    """Noticed two seconds late, the plate has been ringing down since the watchdog ran out."""
+    """Two seconds later, the plate has been decaying since the watchdog expired."""
     prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
     for bench in (prompt, late):
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
@@ -139,7 +139,7 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
 
 
 def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None:
-    """Read every 3 ms, or once at the end: the same samples of a finger."""
+    """A finger's samples are the same if read every 3 ms or once at the end."""
     records = []
     for is_read in (True, False):
         bench = Bench(coarse_rig, now=START)
@@ -188,7 +188,7 @@ def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
 
 
 def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
-    """Fingers of a rig with none load nothing; where fingers do, an observer does not."""
+    """A rig without fingertips has unloaded fingers; elsewhere an observer loads nothing."""
     bare = Bench(replace(coarse_rig, fingertip=None), now=0.0)
     observed = Bench(replace(coarse_rig, fingertip=Fingertip(contact_mass=0.02)), now=0.0)
     bare.place_fingers({"a": A, "b": B}, now=0.0)
@@ -201,7 +201,7 @@ def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
 
 
 def test_bench_hand_rests_on_four_patches(coarse_rig: Rig) -> None:
-    """Of twelve fingertips: as four loads of three each by the direct solve."""
+    """A hand of twelve fingertips agrees with four loads of three each in the direct solve."""
     tip = Fingertip(contact_mass=0.002)
     bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     hand = {"hand": HAND_LOAD}
@@ -215,7 +215,7 @@ def test_bench_hand_rests_on_four_patches(coarse_rig: Rig) -> None:
 
 
 def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
-    """A finger that loads nothing is recorded at every sample while another comes, truly."""
+    """An observer is recorded correctly at every sample while a finger arrives."""
     tip = Fingertip(contact_mass=0.005)
     bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     sensor = {"P1": (0.2, 0.03)}
@@ -259,7 +259,7 @@ def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
 
 
 def test_finger_that_is_solved_late_is_felt_as_one_that_is_solved_at_once(rig: Rig) -> None:
-    """The plate waits for it, so that samples before and after it are the same."""
+    """The plate waits for the solution, so that earlier and later samples agree."""
     late = driven(
         rig, lambda bench: bench.begin_placing({"a": PLACE_A, "b": PLACE_B}, now=bench.time)
     )
@@ -279,7 +279,7 @@ def test_finger_that_is_solved_late_is_felt_as_one_that_is_solved_at_once(rig: R
 
 
 def test_slide_faster_than_it_is_solved_leaves_out_places_between(rig: Rig) -> None:
-    """Of a finger's landing, three moves and its lift, two moves are never solved."""
+    """Two of three moves between a finger's landing and lift are never solved."""
     bench = Bench(rig, now=0.0)
     for number, at in enumerate((PLACE_A, PLACE_B, C, PLACE_A)):
         bench.begin_placing({"a": at}, now=0.02 * number)
@@ -294,7 +294,7 @@ def test_slide_faster_than_it_is_solved_leaves_out_places_between(rig: Rig) -> N
 async def test_control_replies_while_the_plate_is_solved(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A finger comes and the state is read before its plate is solved; what it feels waits."""
+    """The state is read before the plate with a new finger is solved; its vibration waits."""
     may_solve, solved = threading.Event(), FingerPlacement.solved
     monkeypatch.setattr(
         FingerPlacement, "solved", lambda placement: may_solve.wait(60) and solved(placement)

@@ -69,9 +69,9 @@ def test_rules_are_kept_after_lost_and_doubled_frames(kind: str, lines: str, see
 
 
 ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}
-"""What the table answers for one finger."""
+"""The excitation for one finger."""
 SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}
-"""What it answers for several fingers."""
+"""The excitation for several fingers."""
 _LONGEST = 5.0  # s; a planted bug may cause a deadlock
 
 
@@ -138,7 +138,7 @@ class Scene(Chain):
 
 
 async def arc(scene: Scene) -> None:
-    """An amplifier trips amid a touch, is asked for its faults, cleared and identified again."""
+    """An amplifier trips during a touch; its faults are read, it is cleared and identified."""
     await scene.controller.arm()
     await scene.fingers(1, duration=0.06)
     scene.trip()
@@ -153,7 +153,7 @@ async def arc(scene: Scene) -> None:
 
 
 async def day(scene: Scene) -> None:
-    """Touches, a neighbor, a lift, a stop amid a touch, clearing, arming, disarming."""
+    """Touches, a neighbor, a lift, a stop during a touch, clearing, arming, disarming."""
     await scene.controller.arm()
     await asyncio.sleep(0.12)
     await scene.fingers(1, duration=0.12)

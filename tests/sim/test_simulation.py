@@ -163,7 +163,7 @@ async def test_simulation_exits_on_a_signal_while_it_starts(tmp_path: Path, afte
         await asyncio.sleep(after)
         process.terminate()
         _, err = await asyncio.wait_for(process.communicate(), 30)
-        # -SIGINT: CPython exits so where the signal interrupts an exec(), as of dataclasses.
+        # -SIGINT: CPython exits so if the signal interrupts an exec(), for instance in dataclasses.
         assert process.returncode in (0, 130, -signal.SIGTERM, -signal.SIGINT)
         assert err == b""
 
@@ -181,13 +181,13 @@ async def test_sim_reports_a_package_that_is_missing() -> None:
 
 @pytest.fixture
 def socket_path() -> Iterator[Path]:
-    """A path short enough for a Unix socket, wherever tests keep their files."""
+    """Return a path short enough for a Unix socket."""
     with tempfile.TemporaryDirectory() as folder:
         yield Path(folder) / "control"
 
 
 def mode(path: Path) -> int | None:
-    """Who may use a file, None where there is none."""
+    """Return the permissions of a file, or None if it is missing."""
     return stat.S_IMODE(path.stat().st_mode) if path.exists() else None
 
 

@@ -49,7 +49,7 @@ def test_check_links_warns_of_frequencies_that_no_wire_carries(
         ("modbus+tcp://host/999", "unit must be.*'999'"),
         (f"{BUS}#300", "node must be.*'300'"),
         # The longest part of a set, of 120 words, and its reply: 282 bytes of 11 bits and four
-        # silences of 3.5 of them at 19200 baud are 170 ms, besides three heartbeats of 50 ms.
+        # silences of 3.5 of them at 19200 baud are 170 ms, plus three heartbeats of 50 ms.
         ("modbus+rtu:///dev/ttyS1?baud=19200#1", "at least 320 ms.*got 250 ms"),
         ("serial:///dev/ttyUSB9?baud=115200&address=2", "baud must be 921600 .*got 115200"),
     ],

@@ -19,9 +19,10 @@ from drivers.host.joint_sets import PlayedSet
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BY_NUMBER, CLOCK_UNKNOWN
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import Envelope
 from drivers.voices import Voice
 from drivers.wires.serial_line import SerialWire
-from kit.clock import KINDS, Alter, MemoryLine, group_of, in_virtual_time
+from kit.clock import KINDS, Alter, MemoryLine, group_of, in_virtual_time, unaltered
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 
@@ -107,7 +108,7 @@ class Rig:
         return self.far[name].playback.all_voices[channel]
 
     def alter_replies(self, alter: Alter) -> None:
-        """Alter what comes to the host on all lines."""
+        """Alter all replies on all lines."""
         for line in self.lines:
             line.outward = alter
 
@@ -165,6 +166,32 @@ def layer(
 ) -> AmplifierLayer:
     """Return a layer with a ramp of 1 ms; options: of `AmplifierLayer`."""
     return AmplifierLayer(number, tones, ramp, **options)
+
+
+def of_parts(count: int, level: float = 0.05) -> list[AmplifierLayer]:
+    """Return layers whose set has about so many parts: two onsets of 24 knots take 111 words."""
+    onset = Envelope(20, ((100, 0),) * 24)
+    tones = [tone(level, onset=onset), tone(level, channel=1, onset=onset)]
+    return [layer(number, *tones) for number in range(count)]
+
+
+def losing(name: str, count: int = 1) -> Alter:
+    """Lose so many messages of a name, or their replies."""
+    remaining = count
+
+    def alter(message: str, data: bytes) -> list[tuple[float, bytes]]:
+        nonlocal remaining
+        if message == name and remaining > 0:
+            remaining -= 1
+            return []
+        return unaltered(message, data)
+
+    return alter
+
+
+def delay_randomly(line: MemoryLine, chance: random.Random) -> None:
+    """Delay bytes by up to 14 ms in each direction, as on a busy machine."""
+    line.inward = line.outward = lambda _, data: [(chance.uniform(0.0, 0.014), data)]
 
 
 def lost(_: str, __: bytes) -> list[tuple[float, bytes]]:

@@ -1,6 +1,6 @@
 """The host's amplifier of protocol 4, on real terminals, TCP connections and CAN adapters.
 
-Which amplifier is at an address, and what it reports that it plays against what it was sent.
+The host identifies the amplifier at an address, and compares reported layers with requested ones.
 """
 
 import asyncio
@@ -28,104 +28,114 @@ from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
 from kit.clock import KINDS, MemoryLine, in_virtual_time
-from kit.wires import WORD_WIRES, hanging_interface, until
+from kit.wires import WORD_WIRES, WordFarSide, hanging_interface, until
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
+from tests.drivers.host.group_on_lines import connect, intercept
 
 
-def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
-    """Of a request that came twice, and late: each of its replies is of its own moment."""
-    line, far = SerialWire(921_600, sequence=1), SimulatedAmplifier("a", channels=2)
-    (question,) = FrameReader().feed(line.request(1, "GetStatus", {}))
+def test_second_status_during_hello_is_not_from_another_amplifier() -> None:
+    """A request arrived twice: its two replies differ in time, but have the same sender."""
+    wire = SerialWire(921_600, sequence=1)
+    amplifier = SimulatedAmplifier("a", channels=2)
+    (request,) = FrameReader().feed(wire.request(1, "GetStatus", {}))
     arrivals = []
     for temperature in (250, 251):
-        words = MESSAGES["GetStatus"].reply.pack({**far.status(0.0), "temperature": temperature})
-        arrivals += line.received(
-            encode_frame(question._replace(kind=question.kind | REPLY_BIT), words)
-        )
-        line.request(1, "Hello", {})
+        status = {**amplifier.status(0.0), "temperature": temperature}
+        words = MESSAGES["GetStatus"].reply.pack(status)
+        reply = request._replace(kind=request.kind | REPLY_BIT)
+        arrivals += wire.received(encode_frame(reply, words))
+        wire.request(1, "Hello", {})
+
     assert [type(arrival) for arrival in arrivals] == [Reply]
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"tcp"}))
+@pytest.mark.parametrize("kind", ["can", "rtu", "serial"])
 @in_virtual_time
-async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
-    """Both reply to Hello, with their serial numbers; it names the remedy."""
+async def test_second_amplifier_at_an_address_is_reported(kind: str) -> None:
+    """Both reply to Hello with their serial numbers; other addresses can be opened."""
     line = MemoryLine(kind, "a", "b")
-    ends = line.far_end, line.kind.far_end({2: SimulatedAmplifier("c", channels=2)}, line.send)
-    line.far_end = Mock(receive=lambda data, now: [end.receive(data, now) for end in ends])
+    first = line.far_end
+    second = line.kind.far_end({2: SimulatedAmplifier("c", channels=2)}, line.send)
+
+    def receive(data: bytes, now: float) -> None:
+        first.receive(data, now)
+        second.receive(data, now)
+
+    line.far_end = Mock(receive=receive)
     with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
         await line.hosts["b"].open()
     await line.hosts["a"].open()
 
 
 SENT = LayerSet(2, 20, 0, (Command(0, 2000, 5000, 17_990), Command(1, 2000, 0, 0)))
-CAN = {**capabilities(2), "frequency_step": 3, "level_step": 5, "phase_step": 41}
-PLAYED = SENT.commands[0]
-SAME = [
-    *(PLAYED, replace(PLAYED, frequency=2002), replace(PLAYED, level=4997)),
-    replace(PLAYED, phase=-17_989),  # 21 steps beyond 179.9 degrees, across 180
+STEPS = {**capabilities(2), "frequency_step": 3, "level_step": 5, "phase_step": 41}
+REQUESTED = SENT.commands[0]
+EQUIVALENT = [
+    REQUESTED,
+    replace(REQUESTED, frequency=2002),
+    replace(REQUESTED, level=4997),
+    replace(REQUESTED, phase=-17_989),  # 21 steps beyond 179.9 degrees, across 180
 ]
-OTHER = {
-    "frequency": [replace(PLAYED, frequency=2003)],
-    "level": [replace(PLAYED, level=4996)],
-    "phase": [replace(PLAYED, phase=-17_988)],
+CONTRADICTIONS = {
+    "frequency": [replace(REQUESTED, frequency=2003)],
+    "level": [replace(REQUESTED, level=4996)],
+    "phase": [replace(REQUESTED, phase=-17_988)],
     "level of channel 0": [],
-    "level of channel 1": [PLAYED, Command(1, 2000, 1, 0)],
-    "channels that are not driven": [PLAYED, Command(2, 2000, 1, 0)],
+    "level of channel 1": [REQUESTED, Command(1, 2000, 1, 0)],
+    "channels that are not driven": [REQUESTED, Command(2, 2000, 1, 0)],
 }
+"""Reported tones by the quantity that differs from the requested ones."""
 
 
-def shown(*commands: Command) -> Values:
-    """The reply to GetAchieved of a layer with these tones."""
+def achieved(*commands: Command) -> Values:
+    """Return the reply to GetAchieved of a layer with these tones."""
     return {**asdict(SENT), "commands": [asdict(command) for command in commands]}
 
 
-@pytest.mark.parametrize("played", SAME)
-def test_half_a_step_and_what_the_wire_rounds_is_no_contradiction(played: Command) -> None:
+@pytest.mark.parametrize("command", EQUIVALENT)
+def test_half_a_step_and_rounding_of_the_wire_are_no_contradiction(command: Command) -> None:
     """Half of the steps of the amplifier and of the wire: 2, 3 and 21 steps of the wire."""
-    assert achieved_problem(SENT, shown(played), CAN, is_exact=False, slack=0.5) is None
+    assert achieved_problem(SENT, achieved(command), STEPS, is_exact=False, slack=0.5) is None
 
 
-@pytest.mark.parametrize("name", OTHER)
-def test_more_than_that_is_one(name: str) -> None:
-    """Of frequency, level and phase, and channels that are missing or too many."""
-    problem = achieved_problem(SENT, shown(*OTHER[name]), CAN, is_exact=False, slack=0.5)
-    assert name in problem.quantity
+@pytest.mark.parametrize("quantity", CONTRADICTIONS)
+def test_larger_difference_is_a_contradiction(quantity: str) -> None:
+    """In frequency, level or phase, or by missing or additional channels."""
+    reply = achieved(*CONTRADICTIONS[quantity])
+
+    problem = achieved_problem(SENT, reply, STEPS, is_exact=False, slack=0.5)
+
+    assert quantity in problem.quantity
 
 
 def test_channels_of_one_level_are_scaled_alike() -> None:
-    """Two channels at the same level, one at half of it: a common factor does not explain that."""
-    tones = (Command(0, 2000, 5000, 0), Command(1, 2000, 5000, 0))
-    layer = replace(SENT, commands=tones)
-    halves = [replace(tone, level=2500) for tone in tones]
+    """A common factor does not explain two equal channels of which one plays at half level."""
+    first = Command(0, 2000, 5000, 0)
+    second = Command(1, 2000, 5000, 0)
+    half_first = replace(first, level=2500)
+    half_second = replace(second, level=2500)
+    layer = replace(SENT, commands=(first, second))
     limits = {"is_exact": False, "can_scale": True}
-    assert achieved_problem(layer, shown(*halves), CAN, **limits) is None
-    problem = achieved_problem(layer, shown(halves[0], tones[1]), CAN, **limits)
+
+    assert achieved_problem(layer, achieved(half_first, half_second), STEPS, **limits) is None
+    problem = achieved_problem(layer, achieved(half_first, second), STEPS, **limits)
     assert problem.quantity == "shares of its channels"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("wire", KINDS)
 @in_virtual_time
-async def test_voltage_and_current_of_each_channel(kind: str) -> None:
-    """In volts and amperes; none without the feature."""
-    end = MemoryLine(kind, "a")
-    far, (host,) = end.far["a"], end.hosts.values()
-    values: Values = {
-        "count": 2,
-        "channels": [
-            {"channel_voltage": 12_345, "channel_current": 250},
-            {"channel_voltage": 0, "channel_current": 0},
-        ],
-    }
-    handle = far.handle
-    far.handle = lambda name, sent, now, **options: (  # type: ignore[method-assign]
-        values if name == "GetMeasured" else handle(name, sent, now, **options)
-    )
-    await host.open()
+async def test_voltage_and_current_of_each_channel(wire: str) -> None:
+    """In volts and amperes; an amplifier without the feature has none."""
+    rig = await connect("a", wire=wire, is_armed=False)
+    first = {"channel_voltage": 12_345, "channel_current": 250}
+    second = {"channel_voltage": 0, "channel_current": 0}
+    intercept(rig.far["a"], "GetMeasured", lambda _: {"count": 2, "channels": [first, second]})
+    host = rig.hosts["a"]
     assert await read_electrical(host) == [(1234.5, 250e-6), (0.0, 0.0)]
-    far.capabilities = {**far.capabilities, "features": 0}
+
+    rig.far["a"].capabilities = {**rig.far["a"].capabilities, "features": 0}
     await host.open()
     assert await read_electrical(host) == []
 
@@ -136,7 +146,7 @@ SERVED = [name for name in WORD_WIRES if name.endswith(("tcp", "server", "socket
 
 @asynccontextmanager
 async def opened_lines() -> AsyncIterator[Lines]:
-    """Lines that are closed at the end."""
+    """Yield lines that are closed at the end."""
     lines = Lines()
     try:
         yield lines
@@ -144,7 +154,26 @@ async def opened_lines() -> AsyncIterator[Lines]:
         await lines.close()
 
 
-async def read_for_ever(amplifier: Amplifier) -> None:
+async def amplifiers_of(lines: Lines, far: WordFarSide) -> dict[str, Amplifier]:
+    """Return all amplifiers of a far side by their numbers."""
+    amplifiers = {}
+    for number in far.amplifiers:
+        name = str(number)
+        amplifiers[name] = await lines.amplifier(far.url(number), LIMITS, name=name)
+    return amplifiers
+
+
+async def play_half(amplifiers: dict[str, Amplifier]) -> Group:
+    """Open and arm a group, and play 0.5 on the first channel of all amplifiers."""
+    group = Group(amplifiers)
+    await group.open()
+    await group.arm()
+    layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
+    await group.apply(dict.fromkeys(amplifiers, layers))
+    return group
+
+
+async def read_until_lost(amplifier: Amplifier) -> None:
     """Read the status until an error, for a minute at most."""
     async with asyncio.timeout(60.0):
         while True:
@@ -152,58 +181,67 @@ async def read_for_ever(amplifier: Amplifier) -> None:
 
 
 def slow_port() -> Mock:
-    """The port that is opened, in half a second; it closes as slowly."""
+    """Replace all ports by one that opens and closes in half a second."""
 
-    async def take(*_: object) -> Mock:
+    async def wait(*_: object) -> Mock:
         await asyncio.sleep(0.5)
         return port
 
-    port = Mock(is_blocked=False, open=AsyncMock(side_effect=take), wait_closed=take)
+    port = Mock(is_blocked=False, open=AsyncMock(side_effect=wait), wait_closed=wait)
     PORT_OPENER.set(port.open)
     return port
 
 
 @in_virtual_time
 async def test_lines_are_closed_before_a_second_close_returns() -> None:
-    """A reconnection closes them as well; opened before that, the port would still be taken."""
+    """If a reconnection opened its lines earlier, the port would still be in use."""
     slow_port()
-    lines, loop = Lines(), asyncio.get_running_loop()
+    lines = Lines()
+    loop = asyncio.get_running_loop()
     await lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x")
-    first = asyncio.create_task(lines.close())
+    first_close = asyncio.create_task(lines.close())
     await asyncio.sleep(0.1)
-    began = loop.time()
-    first.cancel()
+    start = loop.time()
+    first_close.cancel()
+
     await lines.close()
-    assert loop.time() - began == pytest.approx(0.4)
+
+    assert loop.time() - start == pytest.approx(0.4)
 
 
 @in_virtual_time
 async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
-    """As by a shutdown during a reconnection; else the port would stay open, and taken."""
-    port, lines = slow_port(), Lines()
-    opening = [
-        asyncio.ensure_future(lines.amplifier(f"serial:///dev/x?address={n}", LIMITS, name=f"{n}"))
-        for n in (1, 2)
-    ]
+    """A shutdown during a reconnection must not leave the port open."""
+    port = slow_port()
+    lines = Lines()
+    requests = []
+    for address in ("1", "2"):
+        request = lines.amplifier(f"serial:///dev/x?address={address}", LIMITS, name=address)
+        requests.append(asyncio.ensure_future(request))
     await asyncio.sleep(0.1)
+
     await lines.close()
-    for request in opening:
+
+    for request in requests:
         with pytest.raises(LinkError, match="closed"):
             await request
     assert port.close.call_count == port.open.await_count
 
 
 @in_virtual_time
-async def test_bus_that_is_opened_again_goes_on_with_its_numbers() -> None:
-    """An amplifier of a bus discards what has an older number, for 0.1 s: 1 follows 255."""
+async def test_bus_that_is_opened_again_continues_its_numbers() -> None:
+    """For 0.1 s an amplifier discards frames with an older number: 1 follows 255."""
     slow_port()
-    numbers, lines = list[int](), Lines()
+    lines = Lines()
+    numbers: list[int] = []
     for _ in range(2):
         amplifier = await lines.amplifier("can+slcan:///dev/x#5", LIMITS, name="x")
-        sent = amplifier.line.wire.request(5, "GetStatus", {})
-        numbers.append(unpack_frames(sent)[0].data[0])
+        request = amplifier.line.wire.request(5, "GetStatus", {})
+        first_frame = unpack_frames(request)[0]
+        numbers.append(first_frame.data[0])
         await lines.close()
         lines = Lines(lines)
+
     assert numbers[1] == numbers[0] % 255 + 1
 
 
@@ -219,64 +257,59 @@ async def test_bus_that_is_opened_again_goes_on_with_its_numbers() -> None:
 async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
     """Two amplifiers on one line: 0.5 on both after one commit, silent after the stop.
 
-    Nobody has the third address; the others reply as before.
+    No amplifier has the third address; the others continue to reply.
     """
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
-        amplifiers = {
-            str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))
-            for number in far.amplifiers
-        }
-        assert len({amplifier.line for amplifier in amplifiers.values()}) == 1
-        group = Group(amplifiers)
-        await group.open()
-        await group.arm()
-        layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
-        await group.apply(dict.fromkeys(amplifiers, layers))
-        levels = [far.level(number) for number in far.amplifiers]
-        assert levels == pytest.approx([0.5, 0.5], abs=1e-9)
+        amplifiers = await amplifiers_of(lines, far)
+        assert amplifiers["1"].line is amplifiers["2"].line
+
+        group = await play_half(amplifiers)
+
+        levels = {number: far.level(number) for number in far.amplifiers}
+        assert levels == pytest.approx({1: 0.5, 2: 0.5}, abs=1e-9)
         await group.beat()
-        stopped = await group.stop()
-        assert all(outcome.is_confirmed for outcome in stopped.values())
-        assert [far.level(number) for number in far.amplifiers] == [0.0, 0.0]
-        nobody = await lines.amplifier(far.url(3), LIMITS, name="3")
+        outcomes = await group.stop()
+        confirmed = {name: outcome.is_confirmed for name, outcome in outcomes.items()}
+        assert confirmed == {"1": True, "2": True}
+        assert {number: far.level(number) for number in far.amplifiers} == {1: 0.0, 2: 0.0}
+
+        missing = await lines.amplifier(far.url(3), LIMITS, name="3")
         with pytest.raises(LinkTimeout):
-            await nobody.request("GetStatus", {}, timeout=REPLY_TIMEOUT)
-        await group.amplifiers["1"].read_status()
+            await missing.request("GetStatus", {}, timeout=REPLY_TIMEOUT)
+        await amplifiers["1"].read_status()
 
 
 @pytest.mark.real_time
 @pytest.mark.usefixtures("unhurried")
 async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs() -> None:
-    """The other amplifier replies and falls silent during the call that hangs.
+    """The other amplifier replies and becomes silent during the call that hangs.
 
     Once the call returns, the amplifier behind the adapter is stopped, too.
     """
     async with (
-        WORD_WIRES["can+python-can virtual"](1) as behind_adapter,
-        WORD_WIRES["serial"](1) as serial,
+        WORD_WIRES["can+python-can virtual"](1) as can_far,
+        WORD_WIRES["serial"](1) as serial_far,
         opened_lines() as lines,
     ):
         with hanging_interface() as adapter:
-            url = behind_adapter.url(1).replace("virtual", "hanging")
+            can_url = can_far.url(1).replace("virtual", "hanging")
             amplifiers = {
-                "adapter": await lines.amplifier(url, LIMITS, name="adapter"),
-                "other": await lines.amplifier(serial.url(1), LIMITS, name="other"),
+                "can": await lines.amplifier(can_url, LIMITS, name="can"),
+                "serial": await lines.amplifier(serial_far.url(1), LIMITS, name="serial"),
             }
-            group = Group(amplifiers)
-            await group.open()
-            await group.arm()
-            layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
-            await group.apply(dict.fromkeys(amplifiers, layers))
-            await until(lambda: behind_adapter.level(1) == pytest.approx(0.5))
+            group = await play_half(amplifiers)
+            await until(lambda: can_far.level(1) == pytest.approx(0.5))
             adapter.hangs = True
+
             stopping = asyncio.create_task(group.stop())
-            await until(lambda: serial.level(1) == 0.0)
-            await amplifiers["other"].read_status()
-            assert adapter.sending == 1
+
+            await until(lambda: serial_far.level(1) == 0.0)
+            await amplifiers["serial"].read_status()
+            await until(lambda: adapter.sending == 1)
             adapter.resume()
-            stopped = await stopping
-            assert stopped["other"].is_confirmed
-            await until(lambda: behind_adapter.level(1) == 0.0)
+            outcomes = await stopping
+            assert outcomes["serial"].is_confirmed
+            await until(lambda: can_far.level(1) == 0.0)
 
 
 @pytest.mark.real_time
@@ -289,35 +322,32 @@ async def test_stop_of_another_line_is_sent_while_a_can_adapter_hangs() -> None:
 )
 @pytest.mark.usefixtures("unhurried")
 async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
-    """Requests of both amplifiers fail with the same message, and those of a new line do not."""
+    """Requests to both amplifiers fail with the same message, but succeed on a new line."""
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
-        amplifiers = [
-            await lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers
-        ]
-        for amplifier in amplifiers:
+        amplifiers = await amplifiers_of(lines, far)
+        for amplifier in amplifiers.values():
             await amplifier.open()
+        line = amplifiers["1"].line
         far.unplug()
-        messages = set()
-        for amplifier in amplifiers:
-            with pytest.raises(LinkError) as lost:
-                await read_for_ever(amplifier)
-            messages.add(str(lost.value))
-        assert messages == {amplifiers[0].line.loss}
-        assert "was lost" in messages.pop()
-        if wire in SERVED:  # whose server listens on
-            again = await asyncio.gather(
-                *(lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers)
-            )
-            for amplifier in again:
+
+        for amplifier in amplifiers.values():
+            with pytest.raises(LinkError) as loss:
+                await read_until_lost(amplifier)
+            assert str(loss.value) == line.loss
+        assert "was lost" in str(line.loss)
+        if wire in SERVED:  # whose server continues to listen
+            reopened = await amplifiers_of(lines, far)
+            for amplifier in reopened.values():
                 await amplifier.open()
-            assert len({amplifier.line for amplifier in (*again, amplifiers[0])}) == 2
+            assert reopened["1"].line is reopened["2"].line
+            assert reopened["1"].line is not line
         else:
             with pytest.raises(LinkError, match=r"cannot be opened|refused"):
                 await lines.amplifier(far.url(1), LIMITS, name="a")
 
 
 async def test_ports_are_for_one_program_alone() -> None:
-    """A second host of the same terminal is refused, and a second user of the same address."""
+    """A second host of a terminal is rejected, and so is a second user of an address."""
     async with WORD_WIRES["serial"](1) as far, opened_lines() as first, opened_lines() as second:
         await first.amplifier(far.url(1), LIMITS, name="a")
         with pytest.raises(LinkError, match="in use by another program"):

@@ -14,7 +14,6 @@ from drivers.host.set_admission import StagedSet
 from drivers.protocol.definition import FEATURES, MESSAGES
 from drivers.protocol.records import Values
 from drivers.wires.can_frames import CanFrame, pack_frames, segments
-from kit.clock import losing
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from tests.drivers.host.group_on_lines import (
@@ -25,6 +24,7 @@ from tests.drivers.host.group_on_lines import (
     connect,
     intercept,
     layer,
+    losing,
     lost,
     on_wires,
     refuse,

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import LinkDegraded, Preempted
-from drivers.protocol.definition import FEATURES, HIGH_TIME, SPAN
+from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HIGH_TIME, SPAN
 from drivers.wires.serial_line import SerialWire
 from kit.clock import MemoryLine, group_of, in_virtual_time
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
@@ -26,7 +26,6 @@ from tests.drivers.host.group_on_lines import (
     begin,
     connect,
     layer,
-    set_unsteered_clock,
     tone,
 )
 
@@ -66,15 +65,15 @@ async def test_faulty_clock_is_reported_and_stops_nothing(lines: str, case: str)
 
     A clock that stands still or runs backwards is too slow, too. A single amplifier has no error.
     """
-    rig = await connect(*lines.split(), wire="serial", is_armed=False)
-    amplifier = rig.far["a"]
-    amplifier.clock = AmplifierClock(Crystal(3e-5, 0.0, 0.0))
+    ends = [MemoryLine("serial", *names) for names in lines.split()]
+    amplifier = ends[0].far["a"]
+    ahead = -0.4 if case == "not steered" else 0.0
+    amplifier.clock = AmplifierClock(Crystal(3e-5, 0.0, ahead))
     if case in READINGS:
         show(amplifier, READINGS[case])
     elif case == "not steered":
-        set_unsteered_clock(rig, "a", -0.4)
-    await rig.group.open()
-    await rig.group.arm()
+        amplifier.capabilities["clock_error"] = CLOCK_UNKNOWN
+    rig = Rig(ends, await group_of(*ends))
 
     for beat in range(60):
         if beat == 10 and case in JUMPS:

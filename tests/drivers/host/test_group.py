@@ -31,7 +31,7 @@ from group_stops import LINES as STOPPED_LINES
 from group_stops import PER_CHAIN, PROGRAMMES, Tally
 from group_stops import play as play_stops
 from kit.chain import set_running
-from kit.clock import KINDS, MemoryLine, delayed, group_of, in_virtual_time, of_parts, unaltered
+from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
 from kit.courses import Acted
 from late_taps import play as play_late_taps
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
@@ -41,8 +41,10 @@ from tests.drivers.host.group_on_lines import (
     Rig,
     begin,
     connect,
+    delay_randomly,
     layer,
     lost,
+    of_parts,
     on_wires,
     tone,
 )
@@ -316,12 +318,12 @@ async def test_layer_that_ends_during_an_exchange_may_be_shown_or_not(case: str)
     for _ in range(60):
         await rig.apply(*ENDING_LAYERS[case])
         if case == "renewal":
-            delayed(rig.line, chance)
+            delay_randomly(rig.line, chance)
             await asyncio.sleep(chance.uniform(0.02, 0.045))
             await rig.apply(RENEWAL)
         elif case == "waiting":
             await rig.apply(WAITING)
-        delayed(rig.line, chance)
+        delay_randomly(rig.line, chance)
         for _ in range(4):
             await asyncio.sleep(chance.uniform(0.0, 0.02))
             status = await host.read_status()

@@ -1,4 +1,4 @@
-"""Replies that are missing, found late or replaced by other bytes, and what the error names."""
+"""Replies that are missing, late or replaced by other bytes, and the causes that errors name."""
 
 import asyncio
 import re

@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import CommandRefused, LinkDegraded, LinkTimeout
 from drivers.host.requests import Priority
 from drivers.protocol.definition import FEATURES, STATES
-from kit.clock import delayed, losing, unaltered
+from kit.clock import unaltered
 from registry import threads
 from tests.drivers.host.group_on_lines import (
     HALF,
@@ -22,8 +22,10 @@ from tests.drivers.host.group_on_lines import (
     begin,
     block_writes,
     connect,
+    delay_randomly,
     in_turn,
     late,
+    losing,
     lost,
     on_wires,
     refuse,
@@ -358,7 +360,7 @@ async def test_weakened_layer_is_found_when_statuses_are_late(
     """A layer that is dropped or plays at half its level, by two statuses up to 14 ms late."""
     rig = await connect("a", wire=wire)
     await rig.play(0.5)
-    delayed(rig.line, random.Random(6))
+    delay_randomly(rig.line, random.Random(6))
     await asyncio.sleep(0.05)
     playback = rig.far["a"].playback
     if share:

@@ -25,7 +25,7 @@ from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pack_words
-from kit.clock import losing, of_parts, unaltered
+from kit.clock import unaltered
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from tests.drivers.host.group_on_lines import (
@@ -38,7 +38,9 @@ from tests.drivers.host.group_on_lines import (
     intercept,
     late,
     layer,
+    losing,
     lost,
+    of_parts,
     on_wires,
     refuse,
     set_unsteered_clock,
@@ -627,7 +629,7 @@ def play_in_steps(amplifier: SimulatedAmplifier, **steps: int) -> None:
 
 
 async def achieved_tone(rig: Rig, played: PlayedSet) -> Command:
-    """Return what the first amplifier reports about the first tone of a set."""
+    """Return the first tone of a set as the first amplifier achieves it."""
     (command,) = (await rig.hosts["a"].read_achieved(played.layers["a"][0], played.token)).commands
     return command
 

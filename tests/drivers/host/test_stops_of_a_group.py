@@ -20,7 +20,6 @@ from drivers.errors import (
 )
 from drivers.protocol.definition import STATES
 from drivers.wires.wire import BrokenReply
-from kit.clock import losing
 from registry import threads
 from tests.drivers.host.group_on_lines import (
     HALF,
@@ -30,6 +29,7 @@ from tests.drivers.host.group_on_lines import (
     intercept,
     late,
     layer,
+    losing,
     lost,
     on_wires,
     report,

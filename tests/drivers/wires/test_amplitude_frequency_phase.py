@@ -36,7 +36,7 @@ from sim.far_ends.can_amplifiers import CanAmplifiers
 
 
 class Tone(NamedTuple):
-    """What one channel plays in one layer."""
+    """The tones of one channel in one layer."""
 
     amplitude: float  # of full stroke
     frequency: float  # Hz
@@ -304,7 +304,7 @@ async def group_behind_python_can(sent: bytearray) -> AsyncIterator[Group]:
 
 
 async def play(group: Group, case: Case) -> Tones:
-    """Play a set, and read back what the amplifier achieves of it."""
+    """Play a set, and read back the achieved tones."""
     ((name, amplifier),) = group.amplifiers.items()
     await group.apply({name: layers_of(case)})
     achieved: dict[tuple[int, int], Tone] = {}
@@ -321,7 +321,7 @@ def test_wire_carries_amplitude_frequency_and_phase_of_every_channel(
 ) -> None:
     """The bytes of a set, decoded by the pages of the protocol, have the tones of the command.
 
-    A simulated amplifier that is asked what it plays reports the same.
+    The achieved tones of a simulated amplifier are the same.
     """
     sent = bytearray()
 

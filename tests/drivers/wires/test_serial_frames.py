@@ -43,12 +43,16 @@ CAN_FRAMES = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
 
 def slcan_text(frame: CanFrame) -> bytes:
     """Return a frame as an adapter writes it, with LAWICEL's command t."""
-    return f"t{frame.id:03X}{len(frame.data):X}{frame.data.hex()}\r".encode()
+    length = len(frame.data)
+    text = f"t{frame.id:03X}{length:X}{frame.data.hex()}\r"
+    return text.encode()
 
 
 def socketcand_text(frame: CanFrame) -> bytes:
     """Return a frame as a socketcand server writes it."""
-    return f"< frame {frame.id:03X} 1700000000.123456 {frame.data.hex().upper()} >".encode()
+    digits = frame.data.hex().upper()
+    text = f"< frame {frame.id:03X} 1700000000.123456 {digits} >"
+    return text.encode()
 
 
 STREAMS = {
@@ -61,7 +65,10 @@ of_every_kind = pytest.mark.parametrize("stream", STREAMS.values(), ids=STREAMS)
 
 def read_all(reader: Any, pieces: Iterable[bytes]) -> list[object]:
     """Return the frames that a reader finds in pieces of a stream."""
-    return list(itertools.chain.from_iterable(reader.feed(piece) for piece in pieces))
+    frames: list[object] = []
+    for piece in pieces:
+        frames += reader.feed(piece)
+    return frames
 
 
 @of_every_kind
@@ -72,8 +79,11 @@ def test_reader_finds_the_same_frames_in_pieces_of_any_size(
     """However the stream is cut."""
     frames = data.draw(st.lists(stream.frames, max_size=5))
     text = b"".join(map(stream.encode, frames))
-    cuts = sorted(data.draw(st.lists(st.integers(0, len(text)), max_size=8)))
-    pieces = [text[start:end] for start, end in itertools.pairwise([0, *cuts, len(text)])]
+    positions = st.integers(0, len(text))
+    cuts = sorted(data.draw(st.lists(positions, max_size=8)))
+    pieces = []
+    for start, end in itertools.pairwise([0, *cuts, len(text)]):
+        pieces.append(text[start:end])
 
     assert read_all(stream.open_reader(), pieces) == frames
 
@@ -91,8 +101,10 @@ def frame_by_hand(kind: int, version: int, address: int, sequence: int, payload:
     """Return a frame by the specification, with zlib's CRC and COBS for short blocks."""
     body = struct.pack("<BBBH", kind, version, address, sequence) + payload
     checked_body = body + struct.pack("<I", zlib.crc32(body))
-    blocks = checked_body.split(b"\0")
-    return b"\0" + b"".join(bytes([len(block) + 1]) + block for block in blocks) + b"\0"
+    encoded = b""
+    for block in checked_body.split(b"\0"):
+        encoded += bytes([len(block) + 1]) + block
+    return b"\0" + encoded + b"\0"
 
 
 @given(SERIAL_FRAMES)

@@ -47,7 +47,7 @@ PER_SECOND = 214_748_364.8
 def test_clock_goes_round_in_20_s() -> None:
     """A clock without errors shows a quarter of its span after 5 s, and again after 25.
 
-    So a high word of 0x4000 comes at 5 s, behind the end of a turn at 25 s, and at 5 s at once.
+    So the high word 0x4000 comes at 5 s, or after the end of a turn at 25 s.
     """
     clock = AmplifierClock()
     assert [clock.reading(time) for time in (0.0, 5.0, 20.0, 25.0)] == [0, 1 << 30, 0, 1 << 30]
@@ -310,14 +310,14 @@ async def client(end: TcpEnd) -> AsyncIterator[Client]:
 
 
 async def ask(connection: Client, request: bytes, size: int) -> bytes:
-    """What a client receives for bytes that it sends."""
+    """Return the bytes that a client receives for a request."""
     reader, writer = connection
     writer.write(request)
     return await asyncio.wait_for(reader.readexactly(size), TIMEOUT)
 
 
 async def test_connections_share_the_registers_of_a_unit(coarse_rig: Rig) -> None:
-    """What one client has written, tag 7 to Stop, the other reads: another unit says nothing."""
+    """One client writes tag 7 to Stop, and the other reads it; another unit does not reply."""
     async with tcp_end(coarse_rig) as end, client(end) as writing, client(end) as reading:
         write = struct.pack(">HHHBBHHBHH", 2, 0, 11, 1, 16, 256 * 8, 2, 4, 7, 0)
         assert (await ask(writing, write, 12))[6:] == write[6:12]
@@ -328,7 +328,7 @@ async def test_connections_share_the_registers_of_a_unit(coarse_rig: Rig) -> Non
 
 
 async def test_client_that_does_not_read_is_disconnected(coarse_rig: Rig) -> None:
-    """Its replies fill no memory, and others are served."""
+    """Its replies fill no memory, and other clients are served."""
     async with tcp_end(coarse_rig) as end, client(end) as well_behaved:
         loop = asyncio.get_running_loop()
         with socket.socket() as deaf:
@@ -347,8 +347,8 @@ async def test_client_that_does_not_read_is_disconnected(coarse_rig: Rig) -> Non
         assert len(end.connections) == 1
 
 
-async def test_seventeenth_connection_is_closed_at_once(coarse_rig: Rig) -> None:
-    """The first ones go on."""
+async def test_seventeenth_connection_is_closed_immediately(coarse_rig: Rig) -> None:
+    """The first connections continue."""
     async with tcp_end(coarse_rig) as end, contextlib.AsyncExitStack() as stack:
         clients = [await stack.enter_async_context(client(end)) for _ in range(17)]
         assert await asyncio.wait_for(clients[16][0].read(), TIMEOUT) == b""
@@ -357,14 +357,14 @@ async def test_seventeenth_connection_is_closed_at_once(coarse_rig: Rig) -> None
 
 
 async def test_port_in_use_is_refused(coarse_rig: Rig) -> None:
-    """LinkError with the port and what to do."""
+    """The error names the port and the remedy."""
     async with tcp_end(coarse_rig) as end:
         with pytest.raises(LinkError, match=f"port {end.port}: .*choose another"):
             await tcp_end(coarse_rig, end.port).__aenter__()
 
 
 async def test_frame_of_unknown_function_ends_with_silence(coarse_rig: Rig) -> None:
-    """Over RTU its length is not known: exception 1 comes once the line was silent."""
+    """On RTU its length is unknown: exception 1 is sent after a silence of the line."""
     device, got = make_bench(coarse_rig)[1]["main"], b""
     async with TerminalEnd(device, partial(ModbusAmplifiers, {1: device}, is_rtu=True)) as end:
         fd = os.open(end.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -390,7 +390,7 @@ def _with_check(body: bytes) -> bytes:
 
 
 def on_a_line() -> Callable[..., list[Frame]]:
-    """An amplifier on a serial line: what comes back for the kind and the bytes of a request."""
+    """Return a function that sends a request on a serial line and returns the replies."""
     replies, reader = list[Frame](), FrameReader()
     end = SerialAmplifiers(
         {1: SimulatedAmplifier("a", channels=2)}, lambda data: replies.extend(reader.feed(data))
@@ -417,13 +417,13 @@ def on_a_line() -> Callable[..., list[Frame]]:
     ],
 )
 def test_first_fault_wins_while_disarmed(kind: int, payload: str, version: int, code: str) -> None:
-    """Version, type, words, state."""
+    """The order is version, type, words, state."""
     (reply,) = on_a_line()(kind, payload, version)
     assert (reply.kind, reply.payload[2]) == (0x9F, REFUSALS[code])
 
 
-def test_session_wins_over_what_a_request_asks_for() -> None:
-    """While armed by session 7: a set of session 8 that is cut short, an Arm of another host."""
+def test_wrong_session_is_reported_before_wrong_values() -> None:
+    """Session 7 is armed: a truncated set of session 8, and an Arm of another host."""
     ask = on_a_line()
     ask(3, "0700 FA00 0000")
     for kind, payload, code in (
@@ -435,7 +435,7 @@ def test_session_wins_over_what_a_request_asks_for() -> None:
 
 
 def test_echo_of_an_event_gets_no_reply() -> None:
-    """Of an adapter that hears what it sends: neither Nak nor anything else."""
+    """An adapter may hear its own frames; the amplifier ignores them."""
     assert on_a_line()(30, "00" * 8, 3) == []
 
 
@@ -493,7 +493,7 @@ FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
 def on_bus(
     adapter: Callable[..., FarEnd], *texts: str
 ) -> tuple[CanBus, list[bytes], list[CanFrame]]:
-    """Write texts to an adapter: its bus, what it has written, and what goes onto the bus."""
+    """Write texts to an adapter; return its bus, its replies and the frames on the bus."""
     bus, written, heard = CanBus(), list[bytes](), list[CanFrame]()
     bus.join(heard.append)
     end = adapter(bus, written.append)
@@ -533,7 +533,7 @@ def test_socketcand_session() -> None:
     ],
 )
 def test_socketcand_ignores_malformed_frames(nonsense: str) -> None:
-    """Whatever is wrong with an element, no frame comes of it, and the next is understood."""
+    """A malformed element sends no frame, and the next one is understood."""
     opened = "< open can0 >< rawmode >"
     _, written, heard = on_bus(
         SocketcandClient, f"{opened}{nonsense} >", "< send 123 1 5 >< echo >"
@@ -543,7 +543,7 @@ def test_socketcand_ignores_malformed_frames(nonsense: str) -> None:
 
 
 async def test_slcan_serves_python_can(coarse_rig: Rig) -> None:
-    """Its own interface sets the bit rate, opens the channel, sends and hears."""
+    """python-can's interface sets the bit rate, opens the channel, sends and receives."""
     bus, heard, device = CanBus(), list[CanFrame](), make_bench(coarse_rig)[1]["main"]
     bus.join(heard.append)
     async with TerminalEnd(device, partial(SlcanAdapter, bus), faults=Faults()) as end:
@@ -575,6 +575,6 @@ async def test_slcan_serves_python_can(coarse_rig: Rig) -> None:
     ],
 )
 def test_slcan_replies_like_lawicel(text: str, written: str, sent: list[CanFrame]) -> None:
-    """CR for what was done, BELL for what makes no sense, z and Z for frames that were sent."""
+    """CR confirms a command, BELL rejects one, and z and Z confirm frames."""
     _, answered, heard = on_bus(SlcanAdapter, text)
     assert (b"".join(answered), heard) == (written.encode(), sent)

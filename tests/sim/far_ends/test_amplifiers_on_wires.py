@@ -1,4 +1,4 @@
-"""Simulated amplifiers on wires: which wire each gets, what they do there, and faults of links.
+"""Simulated amplifiers on wires: their assignment, their reactions, and faults of links.
 
 Links fail over every wire, with the required reaction times by the amplifier's clock, in virtual
 time. A rig is also simulated in the host's own process: fingers, faults and their files.
@@ -75,7 +75,7 @@ def assigned(
     *options: str,
     common: SimulatedWire | None = None,
 ) -> Mapping[str, SimulatedWire]:
-    """The wires of amplifiers by their URLs and by options."""
+    """Assign wires to amplifiers by their URLs and by options."""
     return assign_wires(urls, common=common, options=options, defaults=SimulatedWire("serial"))
 
 
@@ -104,14 +104,14 @@ def test_assign_wires_follows_the_urls() -> None:
 
 
 def test_terminals_are_placed_where_urls_outside_dev_have_them() -> None:
-    """One a line; not of a device, of a network, or where an option chooses the wire."""
+    """One for each line, but not for a device, a network, or a wire that an option selects."""
     outside_dev = {"g": "serial:///tmp/g", "h": "serial:///tmp/g?address=2", "i": "serial:///tmp/i"}
     wires = assigned(URLS | outside_dev, "i=serial")
     assert links_of(wires) in ({"g": Path("/tmp/g")}, {"h": Path("/tmp/g")})
 
 
 def test_choose_lines_prefers_a_name_to_all_and_keeps_a_line_whole() -> None:
-    """Amplifiers of one line have one kind, in whatever order the options come."""
+    """Amplifiers of one line have one kind, in any order of the options."""
     wires = assigned()
     chosen = choose_lines(wires, ["b=ftdi", "native"])
     assert [wire.line_kind for wire in chosen.values()] == ["ftdi", "ftdi", *["native"] * 4]
@@ -160,7 +160,7 @@ SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcan
 
 @pytest.fixture(params=WIRES)
 def wire(request: pytest.FixtureRequest) -> SimulatedWire:
-    """Each wire, in its own time where it has one."""
+    """Return each wire, in virtual time if it supports that."""
     wire = WIRES[request.param]
     return replace(wire, speed=SPEEDS.get(wire.kind))
 
@@ -169,7 +169,7 @@ def wire(request: pytest.FixtureRequest) -> SimulatedWire:
 async def test_broadcast_commit_starts_all_at_one_moment(
     coarse_rig: Rig, wire: SimulatedWire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On one line by their own clocks, however long the simulation of each takes; not over TCP.
+    """By their own clocks, however long the simulation of each takes; not over TCP.
 
     And however much either has sent before.
     """
@@ -235,7 +235,7 @@ async def test_fault_silences_an_amplifier_until_it_is_cleared(
             await rig.beat_until(threads.now() + 2.0)
         assert not rig.group.is_armed
         await asyncio.sleep(0.3)
-        assert not any(rig.levels("main"))
+        assert set(rig.levels("main")) == {0.0}
         await asyncio.sleep(1.0)
         await rig.reopen(within=5.0)
 
@@ -284,7 +284,7 @@ async def test_stop_silences_the_other_amplifier_of_a_line_while_one_hangs(
         began = threads.now()
         stopping = asyncio.create_task(rig.group.stop())
         await asyncio.sleep(0.05)
-        assert not any(rig.levels("west"))
+        assert set(rig.levels("west")) == {0.0}
         assert rig.levels("east")[0] == 0.5
         outcomes = await stopping
 
@@ -292,7 +292,7 @@ async def test_stop_silences_the_other_amplifier_of_a_line_while_one_hangs(
         assert not outcomes["east"].is_confirmed
         assert outcomes["east"].may_play_until > began
         await asyncio.sleep(0.3)
-        assert not any(rig.levels("east"))
+        assert set(rig.levels("east")) == {0.0}
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def line_to(device: AmplifierDevice) -> Line:
 
 @in_virtual_time
 async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig: Rig) -> None:
-    """Requests fail at once, the watchdog silences; no line while it is out, a new one after."""
+    """Requests fail immediately, the watchdog silences, and the line opens once plugged in."""
     bench, devices = make_bench(coarse_rig)
     device = devices["main"]
     group = await opened_group(line_to(device))
@@ -337,7 +337,8 @@ async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig
         line_to(device)
     await asyncio.sleep(1.01)
     bench.advance(threads.now())
-    assert not any(bench.amplifiers["main"].summary(bench.time).levels)
+    summary = bench.amplifiers["main"].summary(bench.time)
+    assert set(summary.levels) == {0.0}
     again = await opened_group(line_to(device))
     assert (await again.amplifiers["main"].read_status())["fault"] == FAULTS["WATCHDOG"]
 
@@ -361,7 +362,7 @@ Two frames of 125 us at most and the operating system; 16 ms after an FTDI chip'
 async def test_line_is_that_of_its_url_and_of_usb_where_a_rig_has_several(
     option: str, tmp_path: Path
 ) -> None:
-    """By default as a USB adapter of high speed delays, and not at all as `prompt`."""
+    """By default the delays of a high-speed USB adapter; none with `prompt`."""
     rig = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS)
     lines = Lines()
     main = await lines.amplifier(f"sim://{rig}?amplifier=main{option}", LIMITS, name="main")
@@ -378,13 +379,13 @@ async def test_line_is_that_of_its_url_and_of_usb_where_a_rig_has_several(
 
 @pytest.mark.parametrize("option", ["line=usb", "line="])
 async def test_url_of_an_unknown_line_is_refused(option: str) -> None:
-    """As any other option that is invalid."""
+    """An unknown line is an invalid option."""
     with pytest.raises(CommandError, match="line must be one of"):
         await Lines().amplifier(f"sim://rig.yaml?amplifier=a&{option}", LIMITS, name="a")
 
 
 async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> None:
-    """By URLs with names: the control socket sees both play, and ends with them."""
+    """URLs name the amplifiers; the control socket shows both, and ends with them."""
     rig, control = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS), tmp_path / "control"
     lines = Lines()
     names = ("main", "side")
@@ -430,7 +431,7 @@ async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> Non
     ],
 )
 async def test_invalid_url_is_refused(url: str) -> None:
-    """No rig, an unknown option or amplifier, a seed that is no number."""
+    """A missing rig, an unknown option or amplifier, or a seed that is not a number."""
     with pytest.raises(CommandError, match="sim://"):
         await Lines().amplifier(url, LIMITS, name="a")
 
@@ -488,7 +489,7 @@ def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
 def test_end_of_a_connection_passes_when_a_fault_is_active(
     kind: FaultKind, finds_damage: bool
 ) -> None:
-    """Faults change frames; the end of a connection, an empty frame, is none."""
+    """The end of a connection is an empty frame, which no fault changes."""
     faults = Faults([FaultWindow(fault=kind)])
     passed = faults.pass_on(b"", toward="host", time=1.0, finds_damage=finds_damage)
     assert passed == [(0.0, b"")]
@@ -507,7 +508,7 @@ def test_fault_hits_a_share_of_one_direction() -> None:
 
 @pytest.mark.parametrize("is_closed", [False, True])
 def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None:
-    """At 10 kbit/s forty bytes of ten bits take 40 ms; frames in flight are lost on closing.
+    """At 10 kbit/s, 40 bytes of ten bits take 40 ms; closing loses frames in flight.
 
     They come in pieces of at most 10 ms.
     """
@@ -538,7 +539,7 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
 
 @pytest.mark.parametrize("kind", ["corrupt", "truncate", "incomplete_set"])
 def test_wire_that_finds_damage_loses_the_frame(kind: FaultKind) -> None:
-    """As TCP does; what is only late or double arrives."""
+    """As TCP does; late or doubled frames arrive."""
     for fault, expected in ((kind, []), ("duplicate", [(0.0, FRAME)] * 2)):
         faults = Faults((FaultWindow(fault=fault),))  # type: ignore[arg-type]
         arrived = faults.pass_on(FRAME, toward="amplifier", time=1.0, finds_damage=True)
@@ -582,7 +583,7 @@ async def play(hosted: HostedRig, *levels: float) -> None:
 
 
 async def beat_on(hosted: HostedRig) -> None:
-    """Feed the watchdog as the control loop does, until that fails."""
+    """Feed the watchdog as the control loop does, until a heartbeat fails."""
     while True:
         await asyncio.sleep(HEARTBEAT)
         await hosted.group.beat()
@@ -603,7 +604,7 @@ async def lost(hosted: HostedRig) -> None:
 
 
 async def again(hosted: HostedRig) -> None:
-    """Let it reply, or reopen, clear and arm it, with all faults over."""
+    """End all faults, then let it reply, or reopen, clear and arm it."""
     hosted.devices["main"].recover()
     async with asyncio.timeout(60):
         while hosted.group.is_armed and hosted.group.members.degraded:
@@ -630,7 +631,7 @@ async def test_loss_is_detected_in_time(
     at_work: Callable[[HostedRig], Awaitable[None]],
     coarse_rig: Rig,
 ) -> None:
-    """From the worst moment, right after a reply: 60 ms unplugged, also without a request.
+    """From the worst moment, right after a reply; 60 ms if unplugged, even without a request.
 
     Three heartbeats otherwise, or as many replies of the slowest wires; of a set the computed time.
     """
@@ -653,7 +654,7 @@ async def test_loss_is_detected_in_time(
 @at_every_speed
 @in_virtual_time
 async def test_slow_wire_is_not_lost(wire: str, coarse_rig: Rig) -> None:
-    """Sets and heartbeats that occupy the whole wire are not repeated, not one of 240."""
+    """None of 240 sets and heartbeats that occupy the whole wire is repeated."""
     async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
         for number in range(60):
             await play(hosted, *(0.2 + 0.01 * (number % 2),) * 4)

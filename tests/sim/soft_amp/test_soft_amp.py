@@ -1,4 +1,4 @@
-"""The software amplifier: its settings, its clock, and what a sound server gets from it.
+"""The software amplifier: its settings, its clock, and its samples at a sound server.
 
 What it rejects before any device is opened; the clock while PortAudio states when a block is
 played; and samples through PortAudio's JACK host API, as another client of a real JACK server
@@ -151,8 +151,8 @@ def play(results: Connection) -> None:
 
 
 @pytest.mark.needs("cc")
-def test_clock_is_that_at_the_output() -> None:
-    """It lags the samples by the latency that PortAudio states, and advances by lost samples.
+def test_clock_is_the_time_of_the_output() -> None:
+    """It lags the samples by PortAudio's latency, and advances by lost samples.
 
     The engine is in a process of its own, since its threads have no end.
     """
@@ -194,7 +194,7 @@ def settings(**changed: object) -> SoftAmplifierSettings:
     ],
 )
 def test_settings_out_of_range_are_refused(changed: dict[str, object], key: str) -> None:
-    """By the option at fault; the square law leaves no force below a limit of 0.707."""
+    """The error names the option; the square law leaves no force below a limit of 0.707."""
     with pytest.raises(InputError, match=key):
         settings(**changed)
 
@@ -217,7 +217,7 @@ def test_more_than_16_channels_are_two_amplifiers() -> None:
 def test_missing_engine_is_an_error_with_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It says what to install."""
+    """The error names the library to install."""
     monkeypatch.setattr("sim.soft_amp.engine.ENGINE_FILE", tmp_path / "missing.so")
     with pytest.raises(InputError, match="apt install gcc libc6-dev"):
         library.__wrapped__()
@@ -265,7 +265,7 @@ def test_unknown_device_is_rejected_with_a_remedy(
     cause: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Without any device, connect one; else the name that was meant, or how JACK is chosen."""
+    """Connect a device, correct the name, or select JACK in the stated way."""
 
     def query(number: object = None, _kind: object = None) -> object:
         if number is None:
@@ -295,7 +295,7 @@ class _Busy:
 
 
 def test_stream_that_does_not_start_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or its device would stay taken until the program ends."""
+    """Otherwise its device would stay in use until the program ends."""
     library = SimpleNamespace(_StreamBase=_Busy, _ffi=SimpleNamespace(cast=lambda *_: None))
     monkeypatch.setattr("sim.soft_amp.output.sounddevice", lambda: library)
     with pytest.raises(OSError, match="unavailable"):
@@ -325,7 +325,7 @@ def server() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def card(server: str) -> Iterator[Capture]:
-    """What the server gives to its sound card."""
+    """Return the samples that the server sends to its sound card."""
     capture = Capture(server, "recorder", CARD_CHANNELS, is_card=True)
     yield capture
     capture.close()
@@ -374,8 +374,8 @@ def no_amplifier_left() -> Iterator[None]:
 def test_samples_arrive_at_jack_as_commanded(tmp_path: Path) -> None:
     """Level x sin(2 pi f t + phase) within 0.1 dB, and within 0.1 degrees between channels.
 
-    By hand: 1 kHz at level 0.5 has the amplitude 0.5 there, at a rate that nobody stated, and each
-    channel is 30 degrees ahead of the one before. Phases turn by less than 0.1 degrees in 50 ms, so
+    By hand: 1 kHz at level 0.5 has the amplitude 0.5 there, at the server's rate, and each channel
+    leads the previous one by 30 degrees. Phases turn by less than 0.1 degrees in 50 ms, so
     that the frequency is right within 6 mHz. Medians, since a busy machine leaves samples out.
     Silence once the host is lost.
     """
@@ -438,7 +438,7 @@ async def test_killed_or_stopped_amplifier_is_silent_and_restarts_disarmed(
 
 @pytest.mark.real_time
 @pytest.mark.needs("jackd", "portaudio", "cc")
-def test_systemd_is_told_of_sound_and_not_of_a_stall(server: str, tmp_path: Path) -> None:
+def test_systemd_is_notified_of_sound_and_not_during_a_stall(server: str, tmp_path: Path) -> None:
     """READY=1 after the first block, then WATCHDOG=1 until the process is stopped; then nothing.
 
     The socket is that of sd_notify(3).
@@ -488,7 +488,8 @@ async def test_silence_is_an_open_output_of_zeros(server: str, tmp_path: Path) -
         begin = capture.position
         _wait_for_samples(capture, 0.5)
         assert not capture.samples(capture.position - begin).any()
-        assert all(capture.is_played_to(f"zeros:in_{n}") for n in (1, 2))
+        assert capture.is_played_to("zeros:in_1")
+        assert capture.is_played_to("zeros:in_2")
 
     await silent(None)
     await silent(lambda amplifier: amplifier.stop())

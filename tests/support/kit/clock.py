@@ -9,7 +9,6 @@ protocol 4, simulated, of the firmware or of an example, can be judged by confor
 
 import asyncio
 import functools
-import inspect
 import random
 import threading
 from collections import Counter
@@ -23,10 +22,8 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import NETWORK_DELAY, PORT_OPENER
 from drivers.protocol.definition import BY_NUMBER, HELLO
-from drivers.protocol.sets import Envelope
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CANOPEN, REQUEST, CanFrame, cob_id, pack_frames, unpack_frames
 from drivers.wires.modbus import ModbusWire
@@ -593,16 +590,6 @@ class MemoryLine:
         ]
 
 
-def tone(channel: int = 0, level: float = 0.5, **other: object) -> AmplifierTone:
-    """A tone of 100 Hz at half level unless told otherwise."""
-    return AmplifierTone(channel, 100.0, level, **other)  # type: ignore[arg-type]
-
-
-def layer(number: int, *tones: AmplifierTone, **other: object) -> AmplifierLayer:
-    """A layer with a ramp of 1 ms."""
-    return AmplifierLayer(number, tones, 0.001, **other)  # type: ignore[arg-type]
-
-
 async def group_of(*ends: MemoryLine, is_armed: bool = True, **options: Any) -> Group:
     """The group of all hosts of lines, open and armed; options: as a `Group` takes them."""
     hosts = {name: host for end in ends for name, host in end.hosts.items()}
@@ -611,62 +598,6 @@ async def group_of(*ends: MemoryLine, is_armed: bool = True, **options: Any) -> 
     if is_armed:
         await group.arm()
     return group
-
-
-def grouped(*lines: tuple[str, ...], wire: str = "") -> Callable[[Callable[..., Any]], Any]:
-    """Run a test with an armed group of amplifiers, by their names on each line, and the lines.
-
-    wire: the kind of all lines, else the argument or fixture of that name.
-    """
-
-    def decorate(test: Callable[..., Any]) -> Callable[..., None]:
-        given = [*inspect.signature(test).parameters.values()][2:]
-        own = [each.name for each in given]
-        if not wire and "wire" not in own:
-            given.append(inspect.Parameter("wire", inspect.Parameter.KEYWORD_ONLY))
-
-        @functools.wraps(test)
-        def run(**arguments: Any) -> None:
-            passed = {name: arguments[name] for name in own}
-
-            async def play() -> None:
-                ends = [MemoryLine(wire or arguments["wire"], *names) for names in lines]
-                await test(await group_of(*ends), ends, **passed)
-
-            run_virtual(play())
-
-        run.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
-        return run
-
-    return decorate
-
-
-def losing(*names: str, count: int = 1) -> Alter:
-    """Loses so many frames of these messages, in whichever direction."""
-    left = count
-
-    def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        nonlocal left
-        if name in names and left > 0:
-            left -= 1
-            return []
-        return unaltered(name, data)
-
-    return alter
-
-
-def of_parts(count: int, level: float = 0.05) -> list[AmplifierLayer]:
-    """Layers whose set has about so many parts: a layer of two onsets of 24 knots has 111 words."""
-    tones = [tone(each, level, onset=Envelope(20, ((100, 0),) * 24)) for each in (0, 1)]
-    return [layer(number, *tones) for number in range(count)]
-
-
-LATEST = 0.014  # s, each way
-
-
-def delayed(end: MemoryLine, rng: random.Random) -> None:
-    """Have what passes a line come late, as on a busy machine."""
-    end.inward = end.outward = lambda name, data: [(rng.uniform(0.0, LATEST), data)]
 
 
 PROTOCOLS = {"serial": "serial", "rtu": "Modbus RTU", "tcp": "Modbus TCP", "can": "CAN"}

@@ -152,12 +152,6 @@ def test_answer_depends_on_the_load_of_a_quiet_finger(table: era.LocalizationTab
     assert heavy.layers != light.layers
 
 
-def test_contrast_map_refuses_drive_modes_as_text(table: era.LocalizationTable) -> None:
-    """Its letters would be taken for drive modes."""
-    with pytest.raises(era.InputError, match=r"must be a list such as \['phased'\], got 'phased'"):
-        era.contrast_map(table, [QUIET], drive_modes="phased")
-
-
 # Frames and pictures
 
 

@@ -140,15 +140,6 @@ def test_resting_hand_is_counted_and_not_protected() -> None:
     assert shares[1] < 0.8
 
 
-def test_load_of_a_hand_is_known_within_a_factor_of_three() -> None:
-    """A fingertip's has the tolerance of the rig."""
-    table = smooth_table()
-
-    stds = table.attached.load_stds(2, (1.0, HAND_LOAD))
-
-    assert stds.tolist() == pytest.approx([table.uncertainty.fingertip, np.log(3)], rel=0.01)
-
-
 def test_contents_of_one_frequency_may_meet_in_phase() -> None:
     """At a finger, amplitudes of one frequency add, powers of two: 3, 4 and 12 make 7² + 12².
 

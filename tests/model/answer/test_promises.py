@@ -24,7 +24,7 @@ from kit.plates import (
     small_table,
     smooth_rig,
 )
-from kit.set_table import drives, phased, wants
+from kit.set_table import phased, wants
 from model.answer.answer import (
     MIN_CONTRAST_DB,
     MIXED,
@@ -35,7 +35,7 @@ from model.answer.answer import (
     verdict_of,
 )
 from model.answer.plan import answer
-from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Stimulus
+from model.answer.stimulus import BY_NAME, MUST, NEVER, Finger, Stimulus
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.finger import THRESHOLDS, detection_threshold
@@ -367,16 +367,6 @@ def test_fingers_9_cm_apart_do_not_share() -> None:
         quiet = [Finger(absent.at) for absent in fingers if absent not in trial]
         contrast = phased(example_table(), trial, quiet, min_contrast_db=-99).promised_worst_db
         assert contrast < MIN_CONTRAST_DB, finger
-
-
-def test_near_fingers_that_may_share_have_one_drive() -> None:
-    """The same as fingers that cannot be kept apart."""
-    willing, near = (
-        phased(example_table(), fingers_at(hands()[0], "abcd", sharing))
-        for sharing in (ANY, BY_NAME)
-    )
-
-    assert drives(willing) == drives(near)
 
 
 # Sets of thresholds

@@ -210,15 +210,6 @@ def test_difference_of_two_equal_drives_follows_from_their_delay() -> None:
     np.testing.assert_allclose(differences, 2 * np.abs(np.sin(half_phases)), atol=2e-4)
 
 
-def test_power_of_delays_is_that_of_normal_phases() -> None:
-    """In the mean square 2 (exp(p²) - 1) of the mean's, for phases with a deviation p."""
-    (share,) = TWO_CLOCKS.power_shares(np.array([250.0]))
-
-    power = np.sum((1 + share) * [[1, -1], [-1, 1]])
-    phase = 2 * math.pi * 250 * 20e-6
-    assert power == pytest.approx(2 * math.expm1(phase**2), rel=1e-4)
-
-
 def test_eras_of_one_amplifier_are_late_together() -> None:
     """Their factors are equal, and those of the other amplifier differ; a mass has no drive."""
     drawing = Drawing(64, 1, 1)

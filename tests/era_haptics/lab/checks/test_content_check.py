@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from controller.content.formats import named_content, read_content
+from controller.content.formats import named_content
 from controller.content.pattern import Pattern, Transient
 from era_haptics.lab.checks.content_check import check_content
-from era_haptics.lab.checks.content_figure import content_figure
 from era_haptics.lab.checks.touch_simulator import loaded_plate
 from era_haptics.lab.cli import app
 from kit.plates import smooth_rig
@@ -241,17 +240,6 @@ def test_sweep_keeps_its_level_but_not_its_sharpness(sweep: Path) -> None:
     assert result.stdout.startswith("plate: the founding paper's, 305 x 229 mm with 4 ERAs; ")
     percentage = math.floor(100 * sharpness)
     assert f"sharpness {percentage} % kept: level good" in result.stdout
-
-
-def test_figure_of_a_sweep_has_the_headline_of_its_check(sweep: Path) -> None:
-    """And the share of its sharpness that is kept."""
-    pattern = read_content(sweep)
-    check = check_content(pattern, table(), 20.0, at=PLACE)
-
-    title = content_figure(pattern, check).axes[0].get_title()
-
-    assert title.startswith(check.headline)
-    assert "sharpness 2" in title
 
 
 @pytest.fixture

@@ -349,15 +349,6 @@ def test_measurement_that_was_not_started_is_not_resumed(make_bench: MakeBench) 
     assert "to go on from" in bench.errors
 
 
-def test_mass_in_other_units_is_refused(make_bench: MakeBench) -> None:
-    """900 g would be a sensor in milligrams."""
-    bench = make_bench()
-
-    assert bench.measure("--sensor-mass", "900") == 2
-
-    assert "mass_g must be from 0" in bench.errors
-
-
 @pytest.mark.parametrize(
     ("options", "cause"),
     [

@@ -31,7 +31,7 @@ Parameters are described in `model.estimate.parameter_space`, their derivatives 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -95,6 +95,9 @@ class ForwardModel:
     viscous_change: ComplexArray | None = None
     """Change of the receptance (f, s, n) [m/N] if losses are viscous, None to neglect it; see
     `viscous_difference`."""
+    latest_attachments: PointCache[AttachmentPoints] = field(default_factory=lambda: PointCache(1))
+    """Attachments of the plate without form errors that were used last, shared with the models that
+    `replace` derives from this one."""
 
     def __post_init__(self) -> None:
         """Raise InputError for a plate with wrong responses and slopes."""
@@ -206,17 +209,12 @@ class ForwardModel:
         """
         footprints = self._footprints(values)
         if self.form is not None:
-            return self._nominal_attachments.moved(footprints, self.movable)
-        located = self._latest_attachments.get(footprints)
-        if located is None:
+            return self._nominal_attachments.moved(footprints)
+        located = self.latest_attachments.get(footprints)
+        if located is None or not located.is_for(self.modes, self.movable):
             located = places_of(self.modes, footprints, self.movable, self.sides)
-            self._latest_attachments.put(footprints, located)
+            self.latest_attachments.put(footprints, located)
         return located
-
-    @cached_property
-    def _latest_attachments(self) -> PointCache[AttachmentPoints]:
-        """Shapes of the modes at the positions that were used last."""
-        return PointCache(1)
 
     @cached_property
     def _nominal_attachments(self) -> AttachmentPoints:

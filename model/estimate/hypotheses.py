@@ -234,6 +234,8 @@ class _Candidate:
 
     variation: Variation
     factor: float
+    plate: SensedPlate
+    """The plate with that factor."""
     misfit: float
     """Before the rest of the rig is fitted."""
 
@@ -242,9 +244,7 @@ def compare_hypotheses(match: Match) -> list[Hypothesis]:
     """Find other plates that explain the values of a match, most likely first."""
     fits = []
     for candidate in _candidates(match)[:FITTED_HYPOTHESES]:
-        rematch = _rematch(match, candidate.variation, candidate.factor)
-        if rematch:
-            fits.append((candidate, rematch))
+        fits.append((candidate, _rematch(match, candidate.plate)))
     fits = ranked_by(fits, lambda pair: -pair[1].fit.cost)
     variations = [candidate.variation for candidate, _ in fits]
     matches = [rematch for _, rematch in fits]
@@ -278,7 +278,7 @@ def _candidates(match: Match) -> list[_Candidate]:
             plate = _solved(match, variation, factor)
             if plate:
                 misfit = _misfit(match.values, plate.responses()[..., match.drives])
-                candidates.append(_Candidate(variation, factor, misfit))
+                candidates.append(_Candidate(variation, factor, plate, misfit))
         if candidates:
             best.append(best_by(candidates, lambda candidate: -candidate.misfit))
     return ranked_by(best, lambda candidate: -candidate.misfit)
@@ -318,11 +318,8 @@ def _misfit(values: ComplexArray, model: ComplexArray) -> float:
     return float(np.nanmean(1 - mac) + _LEVEL_WEIGHT * level_misfit)
 
 
-def _rematch(match: Match, variation: Variation, factor: float) -> Match | None:
-    """Match the plate with another value, None if the value is impossible."""
-    plate = _solved(match, variation, factor)
-    if plate is None:
-        return None
+def _rematch(match: Match, plate: SensedPlate) -> Match:
+    """Match another plate with the values of a match."""
     return match_plate(plate, match.values, drives=match.drives, model_error=match.model_error)
 
 
@@ -337,9 +334,10 @@ def _refined(match: Match, candidate: _Candidate, rematch: Match) -> Match:
     matches = [rematch]
 
     def cost(log_factor: float) -> float:
-        varied = _rematch(match, candidate.variation, math.exp(log_factor))
-        if varied is None:
+        plate = _solved(match, candidate.variation, math.exp(log_factor))
+        if plate is None:
             return rematch.fit.cost * _IMPOSSIBLE_COST
+        varied = _rematch(match, plate)
         matches.append(varied)
         return varied.fit.cost
 

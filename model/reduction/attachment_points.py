@@ -31,8 +31,12 @@ _STEP = 1e-5
 class AttachmentPoints:
     """Shapes at `a` points of attachment and observation; v points can move along x and y."""
 
+    modes: Modes
+    """Modes with these shapes."""
     footprints: FloatArray
     """Position and radius of each (a, 3) [m]."""
+    movable: IntArray
+    """Indices of the movable points (v,)."""
     shapes: FloatArray
     """Mode shapes (a, r)."""
     truncated: FloatArray
@@ -42,12 +46,16 @@ class AttachmentPoints:
     truncated_slopes: FloatArray
     """Derivatives of the sums by the position of the first point (TERMS, 2 v, a) [1/m]."""
 
-    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
+    def is_for(self, modes: Modes, movable: IntArray) -> bool:
+        """Whether these are shapes of the given modes, with slopes at the given points."""
+        return self.modes is modes and np.array_equal(self.movable, movable)
+
+    def moved(self, footprints: FloatArray) -> "AttachmentPoints":
         """The same for other footprints (a, 3), by the slopes of the shapes alone."""
-        moves = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
-        slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
+        moves = (footprints - self.footprints)[self.movable, :2].reshape(-1, 2, 1)
+        slopes = self.shape_slopes.reshape(len(self.movable), 2, self.shapes.shape[1])
         shapes = self.shapes.copy()
-        shapes[movable] += (moves * slopes).sum(axis=1)
+        shapes[self.movable] += (moves * slopes).sum(axis=1)
         return replace(self, footprints=footprints, shapes=shapes)
 
 
@@ -69,7 +77,9 @@ def places_of(
     shape_slopes = place_slopes(modes.shapes_at, moving, sides)
     truncated_slopes = np.moveaxis(place_slopes(truncated_at, moving, sides), 2, 0)
     return AttachmentPoints(
+        modes=modes,
         footprints=footprints,
+        movable=movable,
         shapes=shapes,
         truncated=truncated,
         shape_slopes=shape_slopes.reshape(-1, shapes.shape[1]),

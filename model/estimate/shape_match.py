@@ -112,7 +112,11 @@ class ShapeMatch:
     def confidence(self, channel: int, era: int, rival: int) -> float:
         """Confidence 0 to 1 that the channel drives one ERA and not a rival.
 
-        From Student's t-test on the difference of their misfits over frequencies.
+        From Student's t-test on the difference of their misfits over frequencies, which counts
+        every frequency as independent. Neighboring frequencies near one resonance are not, so that
+        the confidence is overstated: with m dependent values each, t is sqrt(m) times too large. A
+        wiring other than the rig's must therefore also reduce the cost of the fit
+        (`plate_match.best_wiring`).
         """
         misfit = np.log(np.maximum(1 - self.mac[:, channel], _LEAST_MISFIT))
         gain = misfit[:, rival] - misfit[:, era]

@@ -46,11 +46,15 @@ Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long.
 PAPER_GRID = Grid(12, 9)
 
 BACKGROUND_CELL = 0.0254
-"""Approximate side [m] of the cells at whose centers the power around targets is computed, equal to
-the founding paper's."""
+"""Side [m] of the cells at whose centers the power around targets is computed, from the founding
+paper.
+
+Cells tile the plate, so their number n along a side is rounded: cells are up to 1 / (2 n) larger or
+smaller.
+"""
 
 CELLS_PER_WAVELENGTH = 4
-"""Approximate minimum of cells for each bending wavelength."""
+"""Minimum number of cells for each bending wavelength, up to the same rounding."""
 
 
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:

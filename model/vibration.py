@@ -27,7 +27,8 @@ from model.fem import RIGID_BODY_MODES, Mesh, assemble, simply_supported_modes
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted
-from model.reduction.free_plate import FiniteElementModes, FreePlate, solve_free_plate
+from model.reduction.element_modes import FiniteElementModes
+from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_plate import on_springs
 from model.rig.rig import Rig

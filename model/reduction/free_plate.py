@@ -30,55 +30,38 @@ follows from Chebyshev's; its relative error for each mode is
     T_k(t(u)) / T_k(t(1 / s)),    t(u) = 2 u / u_c - 1,
 
 exactly. A Taylor series, the usual residual flexibility with its higher terms, gains a factor of 1
-/ |s u_c| with each term; this polynomial about four times as much.
-"""
+/ |s u_c| with each term; this polynomial about four times as much."""
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem import (
-    DOF_PER_NODE,
-    RIGID_BODY_MODES,
-    Mesh,
-    PlateMatrices,
-    assemble,
-    factorize,
-    lowest_modes,
-)
-from model.reduction.point_cache import PointCache
+from model.fem import Mesh
+from model.reduction.element_modes import FiniteElementModes
+from model.reduction.spectral_modes import SpectralModes
 from model.reduction.surface_modes import RESIDUAL_ORDER, SurfaceModes
-from model.spectral.modes import (
-    MaterialBand,
-    SpectralPlate,
-)
 from model.spectral.plate_mesh import KnownModes, PlateMesh, SpectralMesh
-from model.spectral.polynomials import CLASSES, deflections_by_class
-from model.spectral.unresolved_compliance import UnresolvedCompliance, unresolved_at
 from model.structure.attachments import (
     Attachment,
     attached_stiffness,
     coupled_forces,
     footprints_of,
 )
-from model.structure.footprints import as_footprints, check_footprints_on_plate
+from model.structure.footprints import as_footprints
 from model.structure.modal_elasticity import (
-    Dispersion,
     ModalElasticity,
     check_scales,
     loss_factors,
     modal_receptance,
 )
-from model.structure.plate import Plate, short_wave_plate
+from model.structure.plate import Plate
 from model.structure.sources import Source, unit_accelerations
 
 
@@ -109,225 +92,6 @@ def _interpolation(terms: int) -> tuple[FloatArray, FloatArray]:
     """
     v = (chebyshev.chebpts1(terms) + 1) / 2
     return v, np.asarray(np.linalg.inv(np.vander(v, terms, increasing=True)))
-
-
-_MAX_CACHED = 4  # sets of points whose residual vectors, or shapes, are kept
-_MAX_KEPT_BYTES = 1 << 26  # of residual vectors; residual vectors of a map's raster are not cached
-
-
-class FiniteElementModes:
-    """All modes of a free plate on a mesh below a cut-off; see `FreeModes`.
-
-    shift [rad²/s²]: of the factorization; cutoff_frequency [Hz].
-    """
-
-    def __init__(self, plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float) -> None:
-        self._matrices = matrices = assemble(plate, mesh)
-        self._factor = factorize(matrices.stiffness + shift * matrices.mass)
-        cut = (2 * math.pi * cutoff_frequency) ** 2
-        count = plate.modes_below(cutoff_frequency) + RIGID_BODY_MODES + 4
-        while True:
-            count = min(count, mesh.dof)
-            eigenvalues, vectors = lowest_modes(
-                matrices.stiffness, matrices.mass, count, shift=shift
-            )
-            if eigenvalues[-1] >= cut or count == mesh.dof:
-                break
-            count += count // 3 + 1
-        eigenvalues[:RIGID_BODY_MODES] = 0.0
-        vectors[:, :RIGID_BODY_MODES] = _rigid_modes(matrices)
-        products = np.linalg.cholesky(vectors.T @ (matrices.mass @ vectors))  # a solver is 1e-7 off
-        vectors = linalg.solve_triangular(products, vectors.T, lower=True).T
-        kept = int(np.searchsorted(eigenvalues, cut))
-        self.eigenvalues, self._vectors = eigenvalues[:kept], vectors[:, :kept]
-        self.losses = np.zeros(kept)
-        self.dispersion: Dispersion | None = None
-        self.largest_truncated = 1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift)
-        self._cache = PointCache[FloatArray](_MAX_CACHED)
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
-        return self._matrices.deflection_at(points) @ self._vectors
-
-    def truncated_terms(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and receivers (m, 2)."""
-        residuals = self._residuals(points)
-        receiver_residuals = self._residuals(receivers)
-        forces = np.array([self._matrices.mass @ term.T for term in receiver_residuals])
-        terms = np.empty((2 * RESIDUAL_ORDER, residuals.shape[1], receiver_residuals.shape[1]))
-        terms[0] = self._matrices.deflection_at(points) @ receiver_residuals[0].T
-        for power in range(2, 2 * RESIDUAL_ORDER + 1):
-            terms[power - 1] = residuals[power // 2 - 1] @ forces[(power + 1) // 2 - 1]
-        return terms
-
-    def basis(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
-        """Deflection at receivers of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
-        (unknowns,) = self.unknowns(points)
-        return self._matrices.deflection_at(receivers) @ unknowns
-
-    def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
-        """The columns of `basis` in degrees of freedom, in one part."""
-        residuals = self._residuals(points).reshape(-1, self._matrices.mesh.dof)
-        return (np.hstack([self._vectors, residuals.T]),)
-
-    def _residuals(self, points: FloatArray) -> FloatArray:
-        """Residual vectors of forces at points or footprints, (RESIDUAL_ORDER, n, dof)."""
-        points = np.atleast_2d(np.asarray(points, dtype=float))
-        residuals = self._cache.get(points)
-        if residuals is None:
-            force = self._matrices.deflection_at(points).T.toarray()
-            mass = self._matrices.mass
-            vectors = self._vectors
-            residuals = np.empty((RESIDUAL_ORDER, *force.T.shape))
-            for term in residuals:
-                # Modes that are kept would outweigh the others a million times in the solution.
-                force -= mass @ (vectors @ (vectors.T @ force))
-                displacement = self._factor.solve(force)
-                displacement -= vectors @ (vectors.T @ (mass @ displacement))
-                term[:] = displacement.T / self.largest_truncated
-                force = mass @ term.T
-            if residuals.nbytes <= _MAX_KEPT_BYTES:
-                self._cache.put(points, residuals)
-        return residuals
-
-
-def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
-    """Return heave and both tilts, (dof, 3); a solver returns arbitrary mixtures."""
-    nodes, plate = matrices.mesh.nodes, matrices.plate
-    modes = np.zeros((len(nodes), DOF_PER_NODE, RIGID_BODY_MODES))
-    modes[:, 0, 0] = 1
-    modes[:, 0, 1:] = nodes - [plate.length / 2, plate.width / 2]
-    modes[:, 1, 1] = modes[:, 2, 2] = 1
-    vectors = modes.reshape(matrices.mesh.dof, RIGID_BODY_MODES)
-    modal_masses = (vectors * (matrices.mass @ vectors)).sum(axis=0)
-    return np.asarray(vectors / np.sqrt(modal_masses))
-
-
-@dataclass(frozen=True, eq=False)
-class _PointShapes:
-    """At p points: shapes of the modes (p, r) and truncated ones (p, t), unresolved compliance."""
-
-    shapes: FloatArray
-    truncated: FloatArray
-    unresolved: UnresolvedCompliance
-
-
-class SpectralModes:
-    """All modes of a free plate below a cut-off, by class; see `FreeModes`.
-
-    shift [rad²/s²]: of the order of the lowest modes; cutoff_frequency [Hz]; frequency_max [Hz]: of
-    responses.
-    """
-
-    def __init__(
-        self,
-        plate: Plate,
-        mesh: SpectralMesh,
-        *,
-        shift: float,
-        cutoff_frequency: float,
-        frequency_max: float,
-    ) -> None:
-        self._plate = plate
-        self._mesh = mesh
-        band = MaterialBand(math.sqrt(shift) / (2 * math.pi), frequency_max)
-        spectral = SpectralPlate(plate, (mesh.nx, mesh.ny), band.middle)
-        cut = (2 * math.pi * cutoff_frequency) ** 2
-        self._classes = classes = tuple(
-            spectral.modes(parity, shift=shift, cut=cut, band=band) for parity in CLASSES
-        )
-        # The homogeneous plate that yields under a force in waves that the mesh does not resolve.
-        shortest = 2 * math.pi / mesh.shortest_wavelength
-        self._local_plate = short_wave_plate(plate, shortest, band.middle)
-        self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
-        self.losses = np.concatenate([part.losses for part in classes])
-        dispersion = np.hstack([part.dispersion for part in classes])
-        self.dispersion = Dispersion(band.frequencies, dispersion) if dispersion.any() else None
-        u = 1 / (np.concatenate([part.truncated for part in classes]) + shift)
-        self.largest_truncated = float(u.max())
-        # u / u_c of each truncated mode to the powers 1, 2, ...
-        self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        self._cache = PointCache[_PointShapes](_MAX_CACHED)
-        self._is_softer = False
-
-    def alternatives(self) -> list["SpectralModes"]:
-        """The plate as soft under every force as its polynomials leave possible."""
-        softer = copy(self)
-        softer._is_softer = True
-        return [softer]
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
-        return self._observe(points).shapes
-
-    def truncated_terms(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and receivers (m, 2)."""
-        shapes = self._observe(points)
-        receiver_shapes = self._observe(receivers)
-        terms = (shapes.truncated * self._powers[:, None]) @ receiver_shapes.truncated.T
-        terms[0] += self._local(shapes, receiver_shapes)
-        return np.asarray(terms)
-
-    def basis(self, points: FloatArray, receivers: FloatArray) -> FloatArray:
-        """Deflection at receivers of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
-        shapes = self._observe(points)
-        receiver_shapes = self._observe(receivers)
-        residuals = self._residuals(shapes) @ receiver_shapes.truncated.T
-        residuals[: len(shapes.shapes)] += self._local(shapes, receiver_shapes)
-        return np.hstack([receiver_shapes.shapes, residuals.T])
-
-    def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
-        """The columns of `basis` by symmetry class, without the local compliance."""
-        count = len(self.eigenvalues)
-        residuals = self._residuals(self._observe(points))
-        first_mode = 0
-        first_truncated = 0
-        columns = list[FloatArray]()
-        for part in self._classes:
-            mode_count = len(part.eigenvalues)
-            modes = slice(first_mode, first_mode + mode_count)
-            truncated = slice(first_truncated, first_truncated + len(part.truncated))
-            of_class = np.zeros((len(part.shapes), count + len(residuals)))
-            of_class[:, modes] = part.shapes[:, :mode_count]
-            of_class[:, count:] = part.shapes[:, mode_count:] @ residuals[:, truncated].T
-            columns.append(of_class)
-            first_mode = modes.stop
-            first_truncated = truncated.stop
-        return tuple(columns)
-
-    def _residuals(self, at: _PointShapes) -> FloatArray:
-        """Residual vectors in truncated modes, term by term, (RESIDUAL_ORDER n, t)."""
-        return np.concatenate(at.truncated * self._powers[:RESIDUAL_ORDER, None])
-
-    def _local(self, sources: _PointShapes, receivers: _PointShapes) -> FloatArray:
-        """Compliance in waves that the polynomials do not resolve, in units of u_c."""
-        missing = sources.unresolved.shared_with(receivers.unresolved)
-        if self._is_softer:
-            missing = missing + sources.unresolved.uncertainty(receivers.unresolved)
-        return missing / self.largest_truncated
-
-    def _observe(self, points: FloatArray) -> _PointShapes:
-        """Return the cached shapes at points or footprints on the plate."""
-        points = np.atleast_2d(np.asarray(points, dtype=float))
-        point_shapes = self._cache.get(points)
-        if point_shapes is None:
-            check_footprints_on_plate(points, length=self._mesh.length, width=self._mesh.width)
-            degrees = (self._mesh.nx, self._mesh.ny)
-            bases = deflections_by_class((self._plate.length, self._plate.width), degrees, points)
-            shapes = list[FloatArray]()
-            truncated = list[FloatArray]()
-            for basis, part in zip(bases, self._classes, strict=True):
-                class_shapes = basis @ part.shapes
-                mode_count = len(part.eigenvalues)
-                shapes.append(class_shapes[:, :mode_count])
-                truncated.append(class_shapes[:, mode_count:])
-            point_shapes = _PointShapes(
-                shapes=np.hstack(shapes),
-                truncated=np.hstack(truncated),
-                unresolved=unresolved_at(self._local_plate, degrees, points),
-            )
-            self._cache.put(points, point_shapes)
-        return point_shapes
 
 
 FreeModes: TypeAlias = SpectralModes | FiniteElementModes | SurfaceModes

@@ -18,8 +18,9 @@ from model.spectral.plate_mesh import SpectralMesh
 from model.spectral.polynomials import CLASSES, deflections_by_class
 from model.spectral.unresolved_compliance import UnresolvedCompliance, unresolved_at
 from model.structure.footprints import check_footprints_on_plate
+from model.structure.laminate_bending import short_wave_plate
 from model.structure.modal_elasticity import Dispersion
-from model.structure.plate import Plate, short_wave_plate
+from model.structure.plate import Plate
 
 _MAX_CACHED = 4  # sets of points whose shapes are kept
 

@@ -38,6 +38,7 @@ from model.rig.key_types import (
     Side,
     Thickness,
 )
+from model.structure.laminate_bending import equivalent_plate
 from model.structure.material import (
     STANDARD_HUMIDITY,
     STANDARD_TEMPERATURE,
@@ -47,15 +48,7 @@ from model.structure.material import (
     known_material,
     material_names,
 )
-from model.structure.plate import (
-    MAX_LOSS_EXPONENT,
-    AirGap,
-    Bond,
-    Laminate,
-    LaminateLayer,
-    Plate,
-    equivalent_plate,
-)
+from model.structure.plate import MAX_LOSS_EXPONENT, AirGap, Bond, Laminate, LaminateLayer, Plate
 from model.structure.surface import (
     NU,
     THICKNESS,

@@ -16,17 +16,13 @@ from model.rig.plate_sections import PLAIN_KEYS
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from model.structure.exciter import EXCITER_TYPES, Exciter
-from model.structure.plate import (
-    AirGap,
-    Bond,
-    Laminate,
-    LaminateLayer,
-    Plate,
+from model.structure.laminate_bending import (
     bending,
     freely_sliding,
     perfectly_bonded,
     wavenumber_of,
 )
+from model.structure.plate import AirGap, Bond, Laminate, LaminateLayer, Plate
 from model.structure.surface import Surface
 from registry.limits import GuardLimits
 

@@ -14,7 +14,7 @@ from model.rig.rig_summary import attachment_keys, exciters_of, sections_of
 from model.spectral.plate_mesh import KnownModes
 from model.structure.attachments import DEFAULT_POINTS, least_points
 from model.structure.exciter import Exciter
-from model.structure.plate import slide_frequency
+from model.structure.laminate_bending import slide_frequency
 from model.structure.sources import Era, Gain, Source
 from model.structure.statics import GRAVITY
 from model.structure.surface import WELL_KNOWN

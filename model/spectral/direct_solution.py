@@ -38,16 +38,15 @@ from model.spectral.polynomials import (
 from model.spectral.unresolved_compliance import unresolved_at
 from model.structure.attachments import Attachment, coupled_forces, footprints_of
 from model.structure.footprints import as_footprints
-from model.structure.modal_elasticity import loss_factors
-from model.structure.plate import (
+from model.structure.laminate_bending import (
     CrossSection,
-    LaminateLayer,
-    Plate,
     interface_mass,
     section_of,
     shear_corrections,
     short_wave_plate,
 )
+from model.structure.modal_elasticity import loss_factors
+from model.structure.plate import LaminateLayer, Plate
 from model.structure.sources import Source, unit_accelerations
 
 Responder: TypeAlias = Callable[..., ComplexArray]

@@ -30,14 +30,13 @@ from model.spectral.polynomials import (
     edge_decays,
     follow,
 )
-from model.structure.plate import (
-    LaminateLayer,
-    Plate,
+from model.structure.laminate_bending import (
     interface_mass,
     opposite_motions,
     section_of,
     shear_corrections,
 )
+from model.structure.plate import LaminateLayer, Plate
 
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""

@@ -39,7 +39,8 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.structure.footprints import mean_over
-from model.structure.plate import AirGap, CrossSection
+from model.structure.laminate_bending import CrossSection
+from model.structure.plate import AirGap
 
 EVEN, ODD = 1, -1
 

@@ -35,8 +35,9 @@ from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.plate_mesh import SpectralMesh
 from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
+from model.structure.laminate_bending import equivalent_plate
 from model.structure.material import Material, Orthotropy
-from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
+from model.structure.plate import Bond, Laminate, LaminateLayer
 from model.study.expected_contrast import expected_contrast
 from tests.model.estimate.thin_plates import Hidden, draw, parameters_held
 

@@ -34,15 +34,9 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.plate_mesh import SpectralMesh
 from model.structure.attachments import PointLoad, footprints_of
+from model.structure.laminate_bending import equivalent_plate
 from model.structure.material import Material
-from model.structure.plate import (
-    LOSS_FREQUENCY,
-    AirGap,
-    Laminate,
-    LaminateLayer,
-    Plate,
-    equivalent_plate,
-)
+from model.structure.plate import LOSS_FREQUENCY, AirGap, Laminate, LaminateLayer, Plate
 from model.structure.sources import Era
 from model.study.verification import verify_table
 from model.table.table_file import TableProblem, build_table

@@ -31,6 +31,7 @@ from model.spectral.plate_mesh import SpectralMesh
 from model.spectral.polynomials import air_motion
 from model.spectral.unresolved_compliance import unresolved_at
 from model.structure.attachments import footprints_of
+from model.structure.laminate_bending import equivalent_plate
 from model.structure.material import Material
 from model.structure.plate import (
     HEAT_RATIO,
@@ -40,7 +41,6 @@ from model.structure.plate import (
     Laminate,
     LaminateLayer,
     Plate,
-    equivalent_plate,
 )
 from model.structure.sources import Era
 from model.vibration import natural_modes

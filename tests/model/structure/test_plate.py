@@ -27,13 +27,7 @@ from model.structure.attachments import PointLoad, footprints_of
 from model.structure.exciter import Exciter
 from model.structure.fingertips import Fingertip, FingertipLoad
 from model.structure.footprints import mean_over
-from model.structure.material import Material, Orthotropy, known_material, material
-from model.structure.plate import (
-    AirGap,
-    Bond,
-    Laminate,
-    LaminateLayer,
-    Plate,
+from model.structure.laminate_bending import (
     bending,
     equivalent_plate,
     freely_sliding,
@@ -42,6 +36,8 @@ from model.structure.plate import (
     wave_rigidity,
     wavenumber_of,
 )
+from model.structure.material import Material, Orthotropy, known_material, material
+from model.structure.plate import AirGap, Bond, Laminate, LaminateLayer, Plate
 from model.structure.sources import Era
 from model.structure.statics import (
     GRAVITY,

@@ -12,8 +12,9 @@ from model.config.document import KeyPath
 from model.estimate.forward import ForwardModel, Sensor
 from model.estimate.measurement import Measurement
 from model.estimate.parameter_space import PlateValues
-from model.estimate.parameters import MASS_CELLS, PARAMETER_KINDS
+from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.rig_parameters import rig_with, space_from_datasheets
+from model.estimate.sensor_parameters import MASS_CELLS
 from model.reduction.form_modes import reduced_modes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.actuator_keys import ACTUATOR_KINDS as ACTUATOR_KEYS

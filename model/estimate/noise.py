@@ -80,25 +80,49 @@ def without_outliers(values: ComplexArray, model: ComplexArray) -> tuple[FloatAr
     scales = np.ones(values.shape[1])
     for _ in range(_ROUNDS):
         good = np.where(used, values, np.nan)
-        has_values = used.any(axis=(0, 2))
         gains = np.nan_to_num(gains_of(scales[:, None] * model, good))
         predicted = gains[:, None] * model
-        ratio = np.divide(good, predicted, out=np.full_like(good, np.nan), where=used)
-        scales[has_values] = np.nanmedian(ratio.real[:, has_values], axis=(0, 2))
-        scales = scales / np.median(scales)
+        scales = _sensor_scales(good, predicted, scales)
         residuals = np.abs(values - scales[:, None] * predicted)
-        count = used.sum(axis=1, keepdims=True)
-        # The gain uses up one of the row's values.
-        fraction = np.broadcast_to(1 - 1 / np.maximum(count, 2), values.shape)
-        std = np.where(used, noise_of(good, residuals, fraction), np.inf)
+        std = np.where(used, noise_of(good, residuals, _left_by_row_gain(used)), np.inf)
         relative = np.where(used, residuals / std / np.sqrt(2), 0.0)
-        worst = relative.max(axis=1, keepdims=True)
-        is_outlier = (relative == worst) & (worst > _MAX_RESIDUAL) & (count > 2)
-        remaining = used & ~is_outlier
+        remaining = used & ~_row_outliers(relative, used)
         if (remaining == used).all():
             break
         used = remaining
     return np.where(used, std, np.inf), scales
+
+
+def _sensor_scales(values: ComplexArray, predicted: ComplexArray, former: FloatArray) -> FloatArray:
+    """Return the scale of each sensor relative to the others (s,), from values (f, s, n).
+
+    former (s,): kept by sensors without values.
+    """
+    used = np.isfinite(values)
+    has_values = used.any(axis=(0, 2))
+    ratio = np.divide(values, predicted, out=np.full_like(values, np.nan), where=used)
+    scales = former.copy()
+    scales[has_values] = np.nanmedian(ratio.real[:, has_values], axis=(0, 2))
+    return scales / np.median(scales)
+
+
+def _left_by_row_gain(used: NDArray[np.bool_]) -> FloatArray:
+    """Return the fraction of each value's noise power (f, s, n) that the gain of its row leaves.
+
+    The gain uses up one of the row's values.
+    """
+    count = used.sum(axis=1, keepdims=True)
+    return np.broadcast_to(1 - 1 / np.maximum(count, 2), used.shape)
+
+
+def _row_outliers(relative: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask (f, s, n) of the worst value of each row of more than two, if too far off.
+
+    relative (f, s, n): residuals in standard errors.
+    """
+    worst = relative.max(axis=1, keepdims=True)
+    is_far_off = (worst > _MAX_RESIDUAL) & (used.sum(axis=1, keepdims=True) > 2)
+    return (relative == worst) & is_far_off
 
 
 def noise_of(values: ComplexArray, residuals: FloatArray, fraction: FloatArray) -> FloatArray:
@@ -107,8 +131,6 @@ def noise_of(values: ComplexArray, residuals: FloatArray, fraction: FloatArray) 
     residuals (f, s, n): of a fit; fraction (f, s, n): of the noise power that the fit leaves in
     each residual.
     """
-    from scipy.optimize import nnls
-
     valid = np.isfinite(values)
     size = row_rms(values)
     floor = _MIN_NOISE * size
@@ -118,12 +140,23 @@ def noise_of(values: ComplexArray, residuals: FloatArray, fraction: FloatArray) 
     shows_noise = valid & (fraction > _MIN_NOISE_LEFT)
     power = residuals**2 / np.where(shows_noise, fraction, 1) / 2
     power = np.where(shows_noise, power, np.nan)
-    power = power.swapaxes(1, 2).reshape(-1, values.shape[1])[rows]
-    sizes = size.ravel()[rows]
+    by_row = power.swapaxes(1, 2).reshape(-1, values.shape[1])
+    constant, proportional = _noise_law(by_row[rows], size.ravel()[rows])
+    return np.asarray(np.sqrt(constant + proportional * size**2 + floor**2))
+
+
+def _noise_law(power: FloatArray, sizes: FloatArray) -> tuple[float, float]:
+    """Return a² and b² of rows whose noise power is a² + b² r².
+
+    power (rows, s): of the noise in each value, NaN if unknown; sizes (rows,): r. Fitted to the
+    medians of groups of rows of similar size, relative to each median.
+    """
+    from scipy.optimize import nnls
+
     noise_powers = []
     row_powers = []
     order = np.argsort(sizes, kind="stable")
-    for group in np.array_split(order, min(_MAX_GROUPS, len(rows) // 2)):
+    for group in np.array_split(order, min(_MAX_GROUPS, len(order) // 2)):
         # The median of |z|² of complex noise with variance 2 is 2 log 2.
         noise_powers.append(np.nanmedian(power[group]) / np.log(2))
         row_powers.append(np.median(sizes[group] ** 2))
@@ -131,5 +164,5 @@ def noise_of(values: ComplexArray, residuals: FloatArray, fraction: FloatArray) 
     matrix = np.column_stack([1 / scale, np.array(row_powers) / scale])
     weight = np.linalg.norm(matrix, axis=0)
     solution, _ = nnls(matrix / weight, np.ones(len(scale)))
-    constant, proportional = solution / weight
-    return np.asarray(np.sqrt(constant + proportional * size**2 + floor**2))
+    constant, proportional = (solution / weight).tolist()
+    return constant, proportional

@@ -233,7 +233,7 @@ def parse_pair(text: str, *, what: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def parse_frequencies(text: str, *, what: str = "--frequencies") -> "FloatArray":
+def parse_frequencies(text: str) -> "FloatArray":
     """Parse `LO:HI:STEP`, both ends included, or a list `60,110,250`, to frequencies (f,) [Hz].
 
     Raises InputError for other text, and for a list that does not ascend.
@@ -252,15 +252,16 @@ def parse_frequencies(text: str, *, what: str = "--frequencies") -> "FloatArray"
             raise ValueError
     except (ValueError, OverflowError, ZeroDivisionError):
         raise InputError(
-            f"{what} must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
+            "--frequencies must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
             f"60:320:10, or a list above zero, such as 60,110, and at most "
             f"{_MAX_FREQUENCIES} frequencies, got {text[:40]!r}"
         ) from None
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < len(values):
         raise InputError(
-            f"{what} must be distinct, got {distinct[counts.argmax()]:g} Hz twice in {text[:40]!r}"
+            f"--frequencies must be distinct, got {distinct[counts.argmax()]:g} Hz twice in "
+            f"{text[:40]!r}"
         )
     if (np.diff(values) < 0).any():
-        raise InputError(f"{what} must ascend, got {text[:40]!r}; sort them")
+        raise InputError(f"--frequencies must ascend, got {text[:40]!r}; sort them")
     return values

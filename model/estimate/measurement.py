@@ -198,14 +198,12 @@ class MeasuredPlate:
     """Further keys and values for programs."""
 
 
-def sensors_at(
-    points: FloatArray, names: Sequence[str] = (), *, mass: float = 0.0
-) -> tuple[Sensor, ...]:
-    """Sensors at points (s, 2) [m] of the plate, by default numbered; mass: as `Sensor.mass`."""
+def sensors_at(points: FloatArray, names: Sequence[str] = ()) -> tuple[Sensor, ...]:
+    """Sensors without mass at points (s, 2) [m] of the plate, by default numbered."""
     if not names:
         names = [f"sensor {number}" for number in range(len(points))]
     named_points = zip(names, np.asarray(points).tolist(), strict=True)
-    return tuple(Sensor(name, x=x, y=y, mass=mass) for name, (x, y) in named_points)
+    return tuple(Sensor(name, x=x, y=y) for name, (x, y) in named_points)
 
 
 def silent_sensors(measurement: Measurement) -> NDArray[np.bool_]:

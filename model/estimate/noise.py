@@ -122,7 +122,7 @@ def _row_outliers(relative: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.b
     """
     worst = relative.max(axis=1, keepdims=True)
     is_far_off = (worst > _MAX_RESIDUAL) & (used.sum(axis=1, keepdims=True) > 2)
-    return (relative == worst) & is_far_off
+    return np.asarray((relative == worst) & is_far_off)
 
 
 def noise_of(values: ComplexArray, residuals: FloatArray, fraction: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ be resumed.
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -168,29 +168,23 @@ def _tell(text: str) -> None:
 
 
 def measure_positions(
-    file: PositionsFile,
-    card: SoundCard,
-    *,
-    periods: int,
-    prompt: Callable[[str], str] = _prompt,
-    tell: Callable[[str], None] = _tell,
+    file: PositionsFile, card: SoundCard, *, periods: int
 ) -> dict[str, MeasuredResponses]:
     """Guide a person through the missing positions; returns the new measurements by position.
 
-    prompt: shows an instruction and returns the input, "q" to stop; tell: prints a line. A position
-    that fails a check is reported with its remedy, and repeated. Raises DeviceLost, OSError;
-    earlier measurements are then in the file.
+    A position that fails a check is reported with its remedy, and repeated. Raises DeviceLost,
+    OSError; earlier measurements are then in the file.
     """
     measured: dict[str, MeasuredResponses] = {}
     pending = file.missing
     last: WiredSensor | None = None
-    tell(
+    _tell(
         "Enter: measure this position; r: repeat the previous one; s: skip; q: stop. Measured "
         "positions are saved"
     )
     while pending:
         place = pending[0]
-        reply = prompt(_instruction(file, place)).strip()
+        reply = _prompt(_instruction(file, place)).strip()
         match reply.lower():
             case "q":
                 break
@@ -200,12 +194,12 @@ def measure_positions(
                 pending.insert(0, last)
                 last = None
             case "":
-                responses = _measure_position(file, card, place, periods=periods, tell=tell)
+                responses = _measure_position(file, card, place, periods=periods)
                 if responses is not None:
                     measured[place.name] = responses
                     last = pending.pop(0)
             case _:
-                tell(f"a reply must be Enter, s, q, or r once, got {reply[:20]!r}")
+                _tell(f"a reply must be Enter, s, q, or r once, got {reply[:20]!r}")
     return measured
 
 
@@ -218,12 +212,7 @@ def _instruction(file: PositionsFile, place: WiredSensor) -> str:
 
 
 def _measure_position(
-    file: PositionsFile,
-    card: SoundCard,
-    place: WiredSensor,
-    *,
-    periods: int,
-    tell: Callable[[str], None],
+    file: PositionsFile, card: SoundCard, place: WiredSensor, *, periods: int
 ) -> MeasuredResponses | None:
     """Measure a position and write it to the file; return None if it fails a check."""
     desk = replace(file.desk, sensors=(place,))
@@ -234,10 +223,10 @@ def _measure_position(
     except DeviceLost:
         raise
     except (InputError, LinkError) as problem:
-        tell(f"{place.name} is not kept: {problem}")
+        _tell(f"{place.name} is not kept: {problem}")
         return None
     file.keep(place, measured)
-    tell(_line(place, measured))
+    _tell(_line(place, measured))
     return measured
 
 

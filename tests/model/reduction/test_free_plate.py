@@ -25,7 +25,7 @@ from model.estimate.rig_parameters import space_of
 from model.estimate.sensed_plate import sensed_plate
 from model.fem import ELEMENTS, MITC4, Mesh, PlateMatrices, assemble
 from model.finger import Grid
-from model.reduction import free_plate
+from model.reduction import element_modes
 from model.reduction.attachment_points import place_slopes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
@@ -423,7 +423,7 @@ def test_uncertain_thickness_is_rejected_if_a_mass_does_not_follow_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Tables of an uncertain thickness, identification and calibration count on scaling."""
-    monkeypatch.setattr(free_plate, "assemble", assemble_framed)
+    monkeypatch.setattr(element_modes, "assemble", assemble_framed)
     paper_rig = make_paper_rig(24, 18)
     values = {field.name: getattr(paper_rig.plate, field.name) for field in fields(Plate)}
     rig = replace(paper_rig, plate=Framed(**values, frame_mass=0.053))

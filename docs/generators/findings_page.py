@@ -1,6 +1,6 @@
 """The table of docs/how-to/measure-your-plate.md: every kind of finding and its criterion."""
 
-from model.estimate.findings import FINDING_KINDS
+from model.estimate.finding_kinds import FINDING_KINDS
 
 
 def finding_kinds() -> str:

@@ -21,13 +21,14 @@ from model.arrays import FloatArray, best_of
 from model.errors import InputError
 from model.estimate.calibration_result import MAX_PREDICTION_ERROR, Calibration
 from model.estimate.fit import Fit, JointPrior
+from model.estimate.fitted_values import Parameter
 from model.estimate.gains import are_impossible
 from model.estimate.loss_law import viscous_difference
 from model.estimate.measurement import Measurement, check_enough_sensors
 from model.estimate.noise import fit_to_noise, without_outliers
 from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.screening import Screening, check_consistency, wrong_size
-from model.estimate.sensed_plate import Parameter, SensedPlate, plate_of
+from model.estimate.sensed_plate import SensedPlate, plate_of
 from model.processes import Progress, unseen
 from model.rig.rig import Rig
 

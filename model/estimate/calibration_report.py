@@ -8,7 +8,7 @@ import numpy as np
 from model.arrays import FloatArray, Point
 from model.estimate.calibration_result import Calibration, HeldOutSensors
 from model.estimate.fit_report import TableRow, confusions, quality_rows, table_lines
-from model.estimate.sensed_plate import Parameter
+from model.estimate.fitted_values import Parameter
 from model.quantities import counted, estimate_text, in_display_unit, percent
 from model.rig.rig import Rig
 from model.structure.exciter import Actuator

@@ -17,11 +17,12 @@ from model.arrays import ComplexArray, FloatArray, Point, rms
 from model.config.document import KeyPath
 from model.estimate.calibration_uncertainty import CalibrationUncertainty, is_clear
 from model.estimate.fit import HELD_OUT_FOLDS, Fit, JointPrior, fit
+from model.estimate.fitted_values import Parameter, errors_by_key
 from model.estimate.gains import gains_of, row_rms
 from model.estimate.measurement import LEAST_SENSORS, Measurement
 from model.estimate.noise import fit_to_noise
 from model.estimate.parameters import FORM_ERRORS, jacobian
-from model.estimate.sensed_plate import Parameter, SensedPlate, errors_by_key
+from model.estimate.sensed_plate import SensedPlate
 from model.files.csv_file import as_frame
 from model.rig.rig import Rig
 

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, rms
 from model.estimate.fit import Fit
+from model.estimate.fitted_values import Parameter
 from model.estimate.gains import gains_of
 from model.estimate.parameters import PARAMETER_KINDS
-from model.estimate.sensed_plate import Parameter, SensedPlate
+from model.estimate.sensed_plate import SensedPlate
 from model.estimate.sensor_parameters import MASS_CELLS
 from model.rig.rig import Uncertainty
 

@@ -2,9 +2,10 @@
 
 from typing import Any
 
-from model.estimate.findings import ChannelVerdict, Finding, Verdict, cycles
+from model.estimate.findings import cycles
 from model.estimate.hypotheses import Hypothesis
 from model.estimate.plate_match import Match
+from model.estimate.verdict import ChannelVerdict, Finding, Verdict
 from model.quantities import percent
 from model.study.verification import MIN_KEPT_SHARE
 

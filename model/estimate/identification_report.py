@@ -11,11 +11,12 @@ from dataclasses import asdict
 from typing import Any
 
 from model.estimate.fit_report import TableRow, confusions, quality_rows, table_lines
+from model.estimate.fitted_values import Parameter
 from model.estimate.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification
 from model.estimate.parameter_kinds import SensorParameter
 from model.estimate.parameter_space import ParameterKind
 from model.estimate.parameters import PARAMETER_KINDS
-from model.estimate.sensed_plate import MAX_GUESSED, Parameter
+from model.estimate.sensed_plate import MAX_GUESSED
 from model.quantities import estimate_text, percent
 from model.study.expected_contrast import ExpectedContrast
 

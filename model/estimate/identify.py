@@ -24,6 +24,7 @@ from model.arrays import FloatArray, rms
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.fit import HELD_OUT_FOLDS, fit
+from model.estimate.fitted_values import errors_by_key, parameters_of
 from model.estimate.gains import are_impossible
 from model.estimate.measurement import Measurement
 from model.estimate.parameter_space import PlateValues, Space
@@ -36,7 +37,6 @@ from model.estimate.relevant_quantities import (
     unknowns,
 )
 from model.estimate.rig_parameters import rig_with
-from model.estimate.sensed_plate import errors_by_key, parameters_of
 from model.estimate.staged_fit import RigFit, fit_board, mode_shift
 from model.processes import Progress, unseen
 from model.rig.rig import Rig, Uncertainty

@@ -14,13 +14,13 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray, best_by
-from model.estimate.findings import Finding
 from model.estimate.gains import gains_of, row_rms
 from model.estimate.measurement import Measurement
 from model.estimate.plate_match import Match
 from model.estimate.sensed_plate import SensedPlate, plate_of
 from model.estimate.shape_match import ShapeMatch, match_shapes
 from model.estimate.staged_fit import solved_for
+from model.estimate.verdict import Finding
 from model.quantities import percent
 from model.rig.rig import Rig
 from model.rig.rig_summary import exciters_of, sections_of

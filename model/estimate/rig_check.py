@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray
 from model.errors import InputError
-from model.estimate.findings import (
-    MAX_FORM_ERROR,
-    ChannelVerdict,
-    Finding,
-    Verdict,
-    match_beyond,
-    with_findings,
-)
+from model.estimate.findings import MAX_FORM_ERROR, match_beyond, with_findings
 from model.estimate.hypotheses import Hypothesis, compare_hypotheses
 from model.estimate.loose_exciters import channels_behind_glue, loosened_channels
 from model.estimate.measurement import (
@@ -53,6 +46,7 @@ from model.estimate.plate_match import (
 from model.estimate.quantity_check import check_phases, check_quantity
 from model.estimate.sensed_plate import SensedPlate, plate_of
 from model.estimate.shape_match import ShapeMatch, match_responses, match_shapes
+from model.estimate.verdict import ChannelVerdict, Finding, Verdict
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from model.structure.sources import Era

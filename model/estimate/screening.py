@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.findings import Verdict, cycles
+from model.estimate.findings import cycles
 from model.estimate.measurement import Measurement
 from model.estimate.plate_match import MAX_FIT_ERROR
 from model.estimate.rig_check import diagnose
+from model.estimate.verdict import Verdict
 from model.quantities import in_display_unit
 from model.rig.rig import Rig
 

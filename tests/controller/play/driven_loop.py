@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 from controller.effects.effect import Region
@@ -21,7 +21,6 @@ MOVED_FINGER = (FINGER[0], 0.18, 0.1)
 """The finger of the chain at another position."""
 FINGER_ELSEWHERE = (FINGER[0], *OTHER[1:])
 """The finger of the chain at the position of the other finger."""
-SILENT_CHANNELS = (0.0, 0.0, 0.0)
 
 
 class Planted(Exception):
@@ -37,9 +36,6 @@ def but_the_other() -> EffectPlayer:
 @dataclass
 class DrivenLoop(Chain):
     """A chain, and the sets and silences of its first amplifier."""
-
-    began: float = field(default_factory=threads.now)
-    """When the chain was made [s]."""
 
     @property
     def state(self) -> GroupState:

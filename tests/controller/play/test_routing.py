@@ -57,35 +57,32 @@ def amplifier(*, line: Any = None, **changes: int) -> Any:
     return Mock(line=line or line_of(INSTANT), capabilities=values, ledger=ledger)
 
 
-def pair(left: Any = None, right: Any = None) -> Mapping[str, Any]:
-    """The two amplifiers of the rig."""
-    return {"left": left or amplifier(), "right": right or amplifier()}
+def pair(first: Any = None, second: Any = None) -> Mapping[str, Any]:
+    """The left and the right amplifier of the rig."""
+    return {"left": first or amplifier(), "right": second or amplifier()}
 
 
 @pytest.mark.parametrize(
-    ("left_steps", "right_steps", "mode"),
+    ("changes", "mode"),
     [
-        ((1, 1), (1, 1), "phased"),
-        ((1, 1), (1, 18_000), "switched"),
-        ((10_000, 1), (1, 1), "switched"),
+        ({"level_step": 1, "phase_step": 1}, "phased"),
+        ({"level_step": 1, "phase_step": 18_000}, "switched"),
+        ({"level_step": 10_000, "phase_step": 1}, "switched"),
     ],
 )
-def test_capabilities_choose_the_best_common_drive_mode(
-    left_steps: tuple[int, int], right_steps: tuple[int, int], mode: str
-) -> None:
-    """According to the steps of level (1e-4) and phase (0.01 degrees) of each amplifier."""
-    left = amplifier(level_step=left_steps[0], phase_step=left_steps[1])
-    right = amplifier(level_step=right_steps[0], phase_step=right_steps[1])
-    playback = playback_capabilities(PAIRED_RIG, pair(left, right))
+def test_capabilities_choose_the_best_common_drive_mode(changes: dict[str, int], mode: str) -> None:
+    """According to the steps of level (1e-4) and phase (0.01 degrees) of the coarsest amplifier."""
+    fine = amplifier(level_step=1, phase_step=1)
+    playback = playback_capabilities(PAIRED_RIG, pair(fine, amplifier(**changes)))
     assert playback.drive_mode == mode
     assert playback.playable[-1] == mode
 
 
 def test_capabilities_are_the_tightest_limits_of_rig_and_amplifiers() -> None:
     """50 Hz and half of the full level on the left, 300 Hz on the right, 0.8 in the rig."""
-    left = amplifier(frequency_min=1000, level_max=5000)
-    right = amplifier(frequency_max=6000)
-    limits = playback_capabilities(PAIRED_RIG, pair(left, right)).limits
+    weak = amplifier(frequency_min=1000, level_max=5000)
+    slow = amplifier(frequency_max=6000)
+    limits = playback_capabilities(PAIRED_RIG, pair(weak, slow)).limits
     assert limits.frequencies == (50.0, 300.0)
     assert limits.amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
 
@@ -120,10 +117,11 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
     third channel 30 and 6. An ending has 7 knots, in a set of its own.
     """
     seconds = 0.010 / (words + 0.5)
-    left_line = line_of(seconds)
-    right_line = left_line if is_shared else line_of(seconds)
-    amplifiers = pair(amplifier(line=left_line), amplifier(line=right_line))
-    assert envelope_support(PAIRED_RIG, amplifiers) == EnvelopeSupport(onset, ending)
+    first_line = line_of(seconds)
+    second_line = first_line if is_shared else line_of(seconds)
+    amplifiers = pair(amplifier(line=first_line), amplifier(line=second_line))
+    support = envelope_support(PAIRED_RIG, amplifiers)
+    assert support == EnvelopeSupport(onset, ending)
 
 
 @pytest.mark.parametrize(
@@ -229,8 +227,10 @@ def test_route_keeps_phase_only_if_all_eras_continue(
 ) -> None:
     """A frequency restarts if an ERA joins it."""
     playing = {"A": AmplifierTone(0, 110.0, 0.5), "C": AmplifierTone(0, 110.0, 0.5)}
-    assert continued_eras(route(drive, PAIRED_RIG, ramp=0, playing=playing)) == continued
-    assert continued_eras(route(drive, PAIRED_RIG, ramp=0)) == set()
+    layers = route(drive, PAIRED_RIG, ramp=0, playing=playing)
+    layers_after_silence = route(drive, PAIRED_RIG, ramp=0)
+    assert continued_eras(layers) == continued
+    assert continued_eras(layers_after_silence) == set()
 
 
 @in_virtual_time

@@ -18,7 +18,6 @@ from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import TuioSource
 from controller.sources.tuio_capture import HEADER, MAX_BYTES, RecordedDatagram, read_capture
 from controller.sources.udp_source import Datagram, Peer
-from examples.make_touches import write_capture
 from kit.clock import in_virtual_time
 from kit.fingers import bundle, cursor, frame, free_port, message
 from kit.plates import make_paper_rig
@@ -493,17 +492,6 @@ def test_dropping_superseded_bundles_does_not_change_the_final_touches(
     ]
     reduced = TuioSource("tuio:").drop_superseded(datagrams)
     assert touches_after(reduced) == touches_after(datagrams)
-
-
-@given(st.lists(st.tuples(st.integers(0, 10**8), st.binary(min_size=1, max_size=40)), min_size=1))
-def test_capture_keeps_datagrams_to_a_microsecond(
-    tmp_path_factory: pytest.TempPathFactory, sent: list[tuple[int, bytes]]
-) -> None:
-    """Malformed datagrams come back, too."""
-    path = tmp_path_factory.mktemp("capture") / "stream.tuio"
-    datagrams = [RecordedDatagram(time / 1e6, payload) for time, payload in sorted(sent)]
-    write_capture(path, datagrams)
-    assert read_capture(path) == datagrams
 
 
 def test_capture_is_read_in_the_documented_format_up_to_its_maximum_size(tmp_path: Path) -> None:

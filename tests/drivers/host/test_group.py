@@ -21,6 +21,7 @@ import pytest
 import drivers
 from drivers.errors import DriverError, LinkTimeout
 from drivers.playing import AmplifierLayer
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import unpack_frames
@@ -30,10 +31,10 @@ from drivers.wires.wire import Wire
 from group_stops import LINES as STOPPED_LINES
 from group_stops import PER_CHAIN, PROGRAMMES, Tally
 from group_stops import play as play_stops
-from kit.chain import set_running
+from kit.chain import FINGER, set_running
 from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
-from kit.courses import Acted
 from late_taps import play as play_late_taps
+from registry import threads
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from tests.drivers.host.group_on_lines import (
@@ -495,13 +496,22 @@ def test_late_frames_are_no_fault(wire: str, amplifiers: int, seed: int) -> None
 @in_virtual_time
 async def test_stuck_watchdog_is_found_although_replies_are_late() -> None:
     """On a shared line one commit feeds all amplifiers before each of them in turn."""
-    async with set_running("a", "b", of=Acted, wire="modbus-rtu") as chain:
+    async with set_running("a", "b", wire="modbus-rtu") as chain:
+
+        def report_a_full_watchdog(name: str, values: Values) -> Values | None:
+            if name != "GetStatus":
+                return None
+            status = chain.far_end.obey(name, values, threads.now())
+            return {**status, "watchdog_left": 250}
+
         chain.host_rules.disturb()  # a status precedes requests that feed
-        chain.delays(0.012)
-        await chain.holds(1.0, "finger")
+        for far_end in chain.far_ends:
+            far_end.delay(0.012)
+        await chain.hold(1.0, down=[FINGER])
         assert chain.controller.group.is_armed
-        chain.answer("GetStatus", watchdog_left=250)
-        await chain.holds(3.0, "finger")
+
+        chain.far_end.lie(report_a_full_watchdog)
+        await chain.hold(3.0, down=[FINGER])
         assert not chain.controller.group.is_armed
 
 

@@ -35,13 +35,14 @@ from drivers.protocol.sets import Assembly, is_last, pack_layers, parts, unpack_
 from drivers.trace import Direction, TraceWriter, tracing
 from drivers.wires.wire import address_of
 from firmware_records import records_header
-from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time, judged
-from kit.wires import LATER, WORD
-from kit.wires import age as age
+from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time
+from kit.judged_lines import judged
 from processes.interrupted import full_disk
 from protocol_tables import records
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.canopen_objects import ObjectServer, SdoAbort
+from tests.drivers.protocol_editions import LATER, WORD
+from tests.drivers.protocol_editions import age as age
 
 STATED = {"older": {"later_voltage": None}, "same": {"later_voltage": WORD}, "newer": {}}
 """The added readings that an amplifier of each age states."""

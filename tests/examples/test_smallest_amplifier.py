@@ -13,7 +13,7 @@ import pytest
 
 from drivers.by_hand.actions import identify_amplifier
 from drivers.wires.serial_frames import Frame, encode_frame
-from kit.clock import judged
+from kit.judged_lines import judged
 from processes.installed import installed_program
 
 ROOT = Path(__file__).parents[2]

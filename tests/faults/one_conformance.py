@@ -14,7 +14,12 @@ import pytest
 from cases import shortly
 from era_haptics.lab.conformance.conformance_report import Result
 from era_haptics.lab.conformance.contract import CHECKS, of_kind
-from kit.clock import JUDGED_LINE_KINDS, judged, plain, short_checks
+from kit.judged_lines import (
+    JUDGED_LINE_KINDS,
+    judged,
+    plain,
+    short_checks,
+)
 from tests.firmware.firmware_machine import FirmwareEnd, build_firmware
 
 _CASES = [

@@ -48,9 +48,10 @@ from drivers.wires.can_frames import REQUEST, SLCAN, CanFrame, segments
 from drivers.wires.modbus_frames import framed
 from firmware_records import records_header
 from kit import hand_frames as hand
-from kit.clock import judged
 from kit.hand_frames import tone as command
-from kit.wires import MASTERS, damage, drive
+from kit.judged_lines import judged
+from kit.modbus_masters import MASTERS, drive
+from kit.wires import damage
 from model.arrays import FloatArray
 from processes.installed import installed_program
 from registry.limits import GuardLimits

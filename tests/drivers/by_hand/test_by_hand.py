@@ -30,12 +30,12 @@ from drivers.trace import tracing
 from drivers.wires.wire import with_address
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.conformance_report import ConformanceReport
-from kit.wires import WORD_WIRES, WordFarSide
 from model.rig.rig_file import example_rig_path
 from processes.patient_daemon import LONG_WATCHDOG, wait_long
 from registry.limits import GuardLimits
 from sim.amplifier import simulated_amplifier
 from sim.amplifier.readings import capabilities
+from tests.drivers.word_wires import WORD_WIRES, WordFarSide
 
 ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(("tcp", "server", "socketcand"))]
 """Wires with one far end; the others have one for each connection, at the first addresses."""

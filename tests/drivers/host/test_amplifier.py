@@ -28,11 +28,13 @@ from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
 from kit.clock import KINDS, MemoryLine, in_virtual_time
-from kit.wires import WORD_WIRES, WordFarSide, hanging_interface, until
+from kit.wires import until
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
+from tests.drivers.hanging_bus import hanging_interface
 from tests.drivers.host.group_on_lines import connect, intercept
+from tests.drivers.word_wires import WORD_WIRES, WordFarSide
 
 
 def test_second_status_during_hello_is_not_from_another_amplifier() -> None:

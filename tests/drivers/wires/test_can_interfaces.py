@@ -27,8 +27,9 @@ from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.can_interfaces import BusPort, Interface, Outbox, PythonCanAddress
 from drivers.wires.wire import address_of
 from kit.clock import in_virtual_time
-from kit.wires import hanging_interface, until
+from kit.wires import until
 from registry import threads
+from tests.drivers.hanging_bus import hanging_interface
 
 SOCKETCAN = Interface(is_watched=True, sends_at_once=True, full_code=105, bus_off=0x40)
 """ENOBUFS of Linux, and CAN_ERR_BUSOFF of linux/can/error.h."""

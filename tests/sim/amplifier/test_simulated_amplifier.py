@@ -28,7 +28,8 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
-from kit.wires import MASTERS, drive, far_side, make_bench, until
+from kit.modbus_masters import MASTERS, drive
+from kit.wires import far_side, make_bench, until
 from model.rig.rig import Rig
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier

@@ -31,10 +31,10 @@ from era_haptics.lab.conformance.request_rows import layer
 from era_haptics.lab.conformance.run import ConformanceRun
 from era_haptics.lab.conformance.session import judge
 from era_haptics.lab.conformance.subject import Subject
-from kit.clock import (
+from kit.clock import in_virtual_time
+from kit.judged_lines import (
     JUDGED_LINE_KINDS,
     JudgedLine,
-    in_virtual_time,
     judged,
     plain,
     short_checks,
@@ -528,7 +528,7 @@ def test_amplifier_that_replies_just_in_time_passes(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After 9 ms, where 10 are allowed."""
-    monkeypatch.setattr("kit.clock.DELAY", 0.0045)
+    monkeypatch.setattr("kit.judged_lines.DELAY", 0.0045)
 
     results = judged(kind, names)
 
@@ -558,7 +558,7 @@ def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where a status takes 8 ms, as at 115 200 baud: 3.3 ms a second show within 6 s."""
-    monkeypatch.setattr("kit.clock.DELAY", 0.004)
+    monkeypatch.setattr("kit.judged_lines.DELAY", 0.004)
 
     results = judged(kind, ["clock_rate"], far=amplifier("steered", channels=4))
 

@@ -9,7 +9,12 @@ import pytest
 from cases import shortly
 from drivers.protocol.records import Values
 from drivers.wires.can_frames import CanFrame, unpack_frames
-from kit.clock import JUDGED_LINE_KINDS, JudgedLine, judged, varied
+from kit.judged_lines import (
+    JUDGED_LINE_KINDS,
+    JudgedLine,
+    judged,
+    varied,
+)
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 

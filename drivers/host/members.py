@@ -174,7 +174,12 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
 
 async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException]:
     """Await all requests to their ends; returns the result or the error of each."""
-    return await asyncio.gather(*requests, return_exceptions=True)
+    if len(requests) != 1:
+        return await asyncio.gather(*requests, return_exceptions=True)
+    try:  # without a task, which would take further iterations of the event loop
+        return [await requests[0]]
+    except Exception as error:
+        return [error]
 
 
 def last_fed_at(amplifier: Amplifier) -> float:

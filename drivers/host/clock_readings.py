@@ -15,6 +15,7 @@ measurement.
 import math
 from collections import deque
 from enum import Enum, auto
+from typing import NamedTuple
 
 from drivers.host.lead_fit import (
     MIN_ERROR,
@@ -63,6 +64,29 @@ class ReadingVerdict(Enum):
     """The clock was moved, has stopped, or runs too fast."""
 
 
+class _LeadBounds(NamedTuple):
+    """The lowest and highest lead at a time that kept readings allow, as lines over time.
+
+    No kept reading was later than its exchange took: this gives a lower bound. No reading shows
+    less than the true lead, so a reading that is above a kept one by more than any crystal gains
+    shows that the clock runs too fast.
+    """
+
+    low: float
+    """Lowest lead [s] at time 0."""
+    high: float
+    """Highest lead [s] at time 0."""
+    rate: float
+    """Change of the lowest lead [s/s]; the highest one changes by MAX_CRYSTAL."""
+
+    def at(self, time: float) -> tuple[float, float]:
+        """Return the lowest and the highest lead [s] at a time [s]."""
+        return self.low + self.rate * time, self.high + MAX_CRYSTAL * time
+
+
+_UNBOUNDED = _LeadBounds(-math.inf, math.inf, 0.0)
+
+
 class ClockReadings:
     """The readings of a clock, and the lead fitted to them; times [s] are of the host's clock."""
 
@@ -80,6 +104,8 @@ class ClockReadings:
     """Length of the parts [s]."""
     _latest: deque[Reading]
     """The latest readings, without their possible delays."""
+    _bounds: _LeadBounds
+    """Bounds of the lead by the kept readings."""
 
     def __init__(self) -> None:
         self.forget(0.0)
@@ -91,10 +117,12 @@ class ClockReadings:
         self._latest = deque(maxlen=_BULK)
         self.fit = LeadFit(time)
         self.is_doubted = False
+        self._bounds = _UNBOUNDED
 
     def forget_kept(self) -> None:
         """Drop the kept readings; the fit stays until the next reading."""
         self._kept.clear()
+        self._bounds = _UNBOUNDED
 
     @property
     def is_empty(self) -> bool:
@@ -129,7 +157,7 @@ class ClockReadings:
         """
         expected = self.fit.on_line(time)
         far = FAR + _FAR_ERRORS * error + clock_error
-        lowest, highest = self._possible_leads(time)
+        lowest, highest = self._bounds.at(time)
         is_early = off < lowest - expected - far - max_early
         is_late = off > max_delay + far or off > max_delay + highest - expected + _TOO_FAST
         self.is_doubted = is_early and not self.is_doubted
@@ -140,17 +168,15 @@ class ClockReadings:
         is_below = off < -FAR - SIGNIFICANT * error
         return ReadingVerdict.BELOW_FIT if is_below else ReadingVerdict.PLAUSIBLE
 
-    def _possible_leads(self, time: float) -> tuple[float, float]:
-        """Return the lowest and the highest lead [s] at a time [s] that kept readings allow.
-
-        No kept reading was later than its exchange took: this gives a lower bound. No reading shows
-        less than the true lead, so a reading that is above a kept one by more than any crystal
-        gains shows that the clock runs too fast.
-        """
+    def _note_bounds(self) -> None:
+        """Note which leads the kept readings allow."""
         rate = self.fit.rate
-        lows = [lead - max_delay - rate * (at - time) for at, lead, max_delay in self._kept]
-        highs = [lead + MAX_CRYSTAL * (time - at) for at, lead, _ in self._kept]
-        return max(lows, default=-math.inf), min(highs, default=math.inf)
+        low = -math.inf
+        high = math.inf
+        for time, lead, max_delay in self._kept:
+            low = max(low, lead - max_delay - rate * time)
+            high = min(high, lead - MAX_CRYSTAL * time)
+        self._bounds = _LeadBounds(low, high, rate)
 
     def lower(self, off: float) -> None:
         """Lower the kept readings because a reading is far below the fit, by -off [s]."""
@@ -158,6 +184,7 @@ class ClockReadings:
             below_fit = max(self.fit.on_line(reading.time) - reading.lead, 0.0)
             lead = reading.lead + min(off + below_fit, 0.0)
             self._kept[number] = reading._replace(lead=lead)
+        self._note_bounds()
 
     def add(self, reading: Reading) -> None:
         """Add a reading, and fit the lead again if it is kept."""
@@ -221,6 +248,7 @@ class ClockReadings:
             del self._kept[:-RECENT]
         error = max(fit.error, min(leads) - fit.offset)
         self.fit = self._centered(fit._replace(error=error), lowest_lead)
+        self._note_bounds()
 
     def _centered(self, fit: LeadFit, lowest_lead: float) -> LeadFit:
         """Return a fit, in the middle of the gap if a few readings are far below most others.

@@ -106,6 +106,8 @@ class Playback:
     """Before this time [s] advancing changes nothing."""
     settles_at: float = field(default=-math.inf, init=False)
     """From this time [s] on, only the ends of layers change anything."""
+    settled_levels: Sequence[float] = field(default_factory=list, init=False)
+    """Sums of the amplitudes to which the voices of each channel lead."""
     tokens: Mapping[int, int] = field(default_factory=dict, init=False)
     """Token of each layer that plays."""
     waiting: Sequence[LayerSet] = field(default_factory=list, init=False)
@@ -114,6 +116,7 @@ class Playback:
     def __post_init__(self) -> None:
         """Start silent."""
         self.all_voices = [()] * self.channels
+        self._note_changes()
 
     def copied(self) -> "Playback":
         """Return a copy, with which one can look ahead."""
@@ -196,14 +199,19 @@ class Playback:
         self.next_due = first
         self.waiting = waiting
         tokens = {}
+        settled_levels = []
         for voices in self.all_voices:
+            settled_level = 0.0
             for voice in voices:
+                settled_level += abs(voice.transition.last)
                 end = voice.transition.end
                 settles = max(settles, end)
                 if not voice.transition.last and end < first:
                     first = end
                 if not voice.has_ended:
                     tokens[voice.layer] = self._layers[voice.layer].token
+            settled_levels.append(settled_level)
+        self.settled_levels = settled_levels
         self.changes_at = first
         self.settles_at = settles
         self.tokens = tokens
@@ -269,10 +277,6 @@ class Playback:
             amplitude = voice.transition.at(time)
             sums[voice.frequency] = sums.get(voice.frequency, 0j) + amplitude
         return sum(map(abs, sums.values()))
-
-    def settled(self, channel: int) -> float:
-        """Return the sum of the amplitudes to which the voices of a channel lead."""
-        return sum(abs(voice.transition.last) for voice in self.all_voices[channel])
 
     def next_tokens(self, layer: int) -> set[int]:
         """Return the possible tokens of a layer, now or after its due changes."""

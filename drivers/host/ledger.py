@@ -300,6 +300,8 @@ class Ledger:
         have changed or not.
         """
         playback = self.playback
+        if not unsure_layers and late >= playback.settles_at:  # the usual case
+            return playback.settled_levels[channel], True
         level = 0.0
         is_settled = not unsure_layers
         for voice in playback.all_voices[channel]:

@@ -579,7 +579,7 @@ class SimulatedAmplifier:
 
     def _changed(self, moment: float) -> None:
         """Record a change of playback."""
-        levels = [self.playback.settled(channel) for channel in self._channels]
+        levels = self.playback.settled_levels
         mean_square = sum([level**2 for level in levels]) / len(levels)
         self._heat = self._heat.driven(moment, load=mean_square)
 

@@ -100,8 +100,7 @@ class ExpectedOutputs:
         if self._report_unclear and self.uncertain_playback.is_ambiguous(start, layers):
             self._report_unclear(_AMBIGUOUS)
         shortened_by = self.uncertain_playback.shortened_by(start, layers)
-        channels = range(self.playback.channels)
-        self._former_levels = [self.playback.settled(channel) for channel in channels]
+        self._former_levels = self.playback.settled_levels
         for layer_set in layers:
             self._note_valid_for(layer_set)
             unknown_until = max(self._unknown_after(layer_set, start), shortened_by)

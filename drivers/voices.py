@@ -162,7 +162,7 @@ def steepest(lines: Iterable[tuple[complex, complex]], step: float, *, is_cosine
     return Slope(max_rise * factor, max_change * factor)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen either
 class Voice:
     """A tone of a layer until it has faded."""
 

@@ -295,7 +295,9 @@ def _valid_touches(
         if beyond > RIM or not plate.contains(x * plate.length, (1 - y) * plate.width):
             rejected.append("off_plate")
             continue
-        valid[ContactKey(frame.source, touch.id)] = replace(touch, x=x, y=y)
+        if (x, y) != (touch.x, touch.y):
+            touch = replace(touch, x=x, y=y)
+        valid[ContactKey(frame.source, touch.id)] = touch
     return valid
 
 

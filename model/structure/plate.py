@@ -385,7 +385,9 @@ class Plate(Sheet):
     def contains(self, x: float, y: float) -> bool:
         """Return whether a point [m] is on the plate, edges included."""
         is_near = 0 <= x <= self.length and 0 <= y <= self.width
-        return is_near and bool(self.covers(np.array([[x, y]]))[0])
+        if not is_near or self.surface is None:
+            return is_near
+        return bool(self.covers(np.array([[x, y]]))[0])
 
     def covers(self, points: FloatArray) -> NDArray[np.bool_]:
         """Whether points (p, 2) [m] of its rectangle are within the outline of a surface, (p,)."""

@@ -38,7 +38,7 @@ test: .venv/installed-test
 	$(BIN)/pytest $(ENDING) -m 'not real_time and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest $(ENDING) -m 'real_time and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $$(grep -rl real_time tests --include='test_*.py')
 
-# The tests nearest to what differs from main: about a minute, stopping at the first failure.
+# The tests nearest to what differs from main: within a minute, stopping at the first failure.
 # Since another commit: make test-changed SINCE=HEAD~3
 test-changed: .venv/installed-test
 	$(BIN)/python tests/programs/changed_tests.py $(if $(SINCE),--since $(SINCE))

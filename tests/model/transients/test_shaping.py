@@ -11,10 +11,8 @@ from kit.plates import (
     STILL,
     faded_base,
     make_paper_rig,
-    make_plate_in_time,
     motion_of,
     shaped_base,
-    stepped_acceleration,
 )
 from model.arrays import ComplexArray, FloatArray, Point, lattice
 from model.errors import InputError
@@ -35,6 +33,7 @@ from model.transients.knots import ONSET_KNOTS, bounded_minimum, hat_acceleratio
 from model.transients.shaping import SAMPLE_RATE, Shaper, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, Tone
+from tests.model.transients.stepped_plate import make_plate_in_time, stepped_acceleration
 
 GAIN_VARIANCE = 0.05**2 + np.radians(5) ** 2
 

@@ -176,32 +176,37 @@ class Clocks:
                 worst = max(worst, _worst_scatter(line_amplifiers, now))
         if worst <= _GOOD:
             return
-        readings: dict[float, list[Amplifier]] = {}  # by their time, so that few timers wake up
         for line, line_amplifiers in unmarked.items():
             if line.late <= GRACE:
-                interval = _line_interval(line_amplifiers, _reading_interval(worst))
-                for number in range(1, int(HEARTBEAT / interval)):
-                    amplifier = next(self._turns[line])
-                    readings.setdefault(number * interval, []).append(amplifier)
-        for delay, amplifiers in readings.items():
-            # A reading that waits for the reply to another one would be sent in step with USB
-            # frames.
-            loop.call_later(self.later(delay), self._read_clocks, amplifiers)
+                self._schedule_readings(line, line_amplifiers, _reading_interval(worst))
+
+    def _schedule_readings(
+        self, line: Line, line_amplifiers: Sequence[Amplifier], min_interval: float
+    ) -> None:
+        """Schedule readings of a line's clocks until the next heartbeat.
+
+        min_interval: between readings of one clock [s], longer on a busy line. A reading that waits
+        for the reply to another one would be sent in step with USB frames.
+        """
+        loop = asyncio.get_running_loop()
+        line_interval = max(min_interval, _busy_time(line_amplifiers) / _MAX_LOAD)
+        interval = line_interval / len(line_amplifiers)
+        for number in range(1, int(HEARTBEAT / interval)):
+            amplifier = next(self._turns[line])
+            loop.call_later(self.later(number * interval), self.read_clock, amplifier)
 
     def later(self, duration: float = 0.0) -> float:
         """Return a duration [s] plus a varying part of a frame."""
         self._dither = (self._dither + _GOLDEN) % 1.0
         return duration + self._dither * _FRAME
 
-    def _read_clocks(self, amplifiers: Sequence[Amplifier]) -> None:
-        """Read the statuses of the amplifiers that reply, can be steered and are not being read."""
-        if self._sets.is_on_several_lines:
-            return
-        for amplifier in amplifiers:
-            reading = self._readings.get(amplifier)
-            is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
-            if is_free and amplifier.no_reply_cause is None and amplifier.line.loss is None:
-                self._readings[amplifier] = amplifier.read_status(Priority.READING)
+    def read_clock(self, amplifier: Amplifier) -> None:
+        """Read the status of an amplifier, if it replies, can be steered and is not being read."""
+        reading = self._readings.get(amplifier)
+        is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
+        is_heard = amplifier.no_reply_cause is None and amplifier.line.loss is None
+        if is_free and is_heard and not self._sets.is_on_several_lines:
+            self._readings[amplifier] = amplifier.read_status(Priority.READING)
 
 
 def _busy_time(line_amplifiers: Sequence[Amplifier]) -> float:
@@ -225,15 +230,6 @@ def _worst_scatter(line_amplifiers: Sequence[Amplifier], now: float) -> float:
 def _reading_interval(scatter: float) -> float:
     """Return the interval between readings of a clock with a scatter above _GOOD [s]."""
     return _MIN_INTERVAL * max((_FAIR - _GOOD) / (scatter - _GOOD), 1.0)
-
-
-def _line_interval(line_amplifiers: Sequence[Amplifier], min_interval: float) -> float:
-    """Return the interval between readings on a line [s].
-
-    min_interval: between readings of one clock [s], longer on a busy line.
-    """
-    clock_interval = max(min_interval, _busy_time(line_amplifiers) / _MAX_LOAD)
-    return clock_interval / len(line_amplifiers)
 
 
 def _kind(amplifier: Amplifier) -> tuple[Any, ...]:

@@ -70,7 +70,8 @@ def test_workers_end_with_a_program_that_is_killed() -> None:
         "from model.processes import on_processes; from test_processes import *\n"
         "if __name__ == '__main__': list(on_processes(2, die_with_the_program, 1, {0: 1}))"
     )
-    folders = (Path(__file__).parent, Path(__file__).parents[1] / "support")
+    tests = Path(__file__).parents[1]
+    folders = (tests / "model", tests / "programs", tests / "support")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
 
     completed = subprocess.run(

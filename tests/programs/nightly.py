@@ -31,6 +31,9 @@ _LAST_LINE_WIDTH = 110
 _RULES = "=-_ "
 """Characters with which pytest frames its last line."""
 
+_OF_THE_CALLING_MAKE = ("MAKEFLAGS", "MAKELEVEL", "MFLAGS")
+"""Variables with options and depth of a make that started this program."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -56,8 +59,9 @@ class Outcome:
 
 def run_target(target: str, folder: Path, log: Path, limit: float) -> Outcome:
     """Run a target of the Makefile in a folder, at most for a limit [s]."""
-    # Options of the calling make, such as its job server, are not for this one.
-    environment = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}
+    environment = dict(os.environ)
+    for name in _OF_THE_CALLING_MAKE:
+        environment.pop(name, None)
     start = time.monotonic()
     with log.open("w", encoding="utf-8") as output:
         process = subprocess.Popen(

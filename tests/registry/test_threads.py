@@ -5,7 +5,7 @@ import gc
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from itertools import islice
 
 import pytest
@@ -14,7 +14,6 @@ from registry.plugins import did_you_mean
 from registry.threads import (
     Backoff,
     DaemonThreads,
-    are_at_work,
     in_thread,
     no_long_collections,
     pauses,
@@ -80,21 +79,28 @@ async def test_awaiter_gets_an_error_when_work_tries_to_end_the_program(
         await asyncio.wait_for(work, timeout=10)
 
 
-def test_work_counts_before_its_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if the scheduler has not run the thread yet when the program ends."""
-    starts = []
+THREAD_THAT_WAITS = """
+import _thread
+from registry.threads import DaemonThreads, are_at_work
 
-    def start_later(function: Callable[..., object], arguments: tuple[object, ...]) -> None:
-        starts.append((function, arguments))
+starts = []
+_thread.start_new_thread = lambda *start: starts.append(start)
+DaemonThreads().submit(int)
+print("submitted:", are_at_work())
+((function, arguments),) = starts
+function(*arguments)
+print("run:", are_at_work())
+"""
 
-    monkeypatch.setattr("_thread.start_new_thread", start_later)
 
-    DaemonThreads().submit(int)
+def test_work_counts_before_its_thread_runs() -> None:
+    """Also if the scheduler has not run the thread yet when the program ends.
 
-    assert are_at_work()
-    ((function, arguments),) = starts
-    function(*arguments)
-    assert not are_at_work()
+    In a process of its own, because threads of other tests count, too.
+    """
+    run = subprocess.run([sys.executable, "-c", THREAD_THAT_WAITS], capture_output=True, text=True)
+
+    assert run.stdout.splitlines() == ["submitted: True", "run: False"], run.stderr
 
 
 @pytest.mark.parametrize(

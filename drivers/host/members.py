@@ -178,6 +178,11 @@ async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException
         return await asyncio.gather(*requests, return_exceptions=True)
     try:  # without a task, which would take further iterations of the event loop
         return [await requests[0]]
+    except asyncio.CancelledError as error:
+        caller = asyncio.current_task()
+        if caller is not None and caller.cancelling():
+            raise
+        return [error]  # only the request was cancelled
     except Exception as error:
         return [error]
 

@@ -11,6 +11,7 @@ import random
 import pytest
 
 from drivers.errors import CommandRefused, LinkDegraded, LinkTimeout
+from drivers.host.members import outcomes
 from drivers.host.requests import Priority
 from drivers.protocol.definition import FEATURES, STATES
 from kit.clock import unaltered
@@ -530,3 +531,26 @@ async def test_lines_have_the_order_of_the_amplifiers(wire: str) -> None:
     rig = await connect(*"abcdefgh", wire=wire)
 
     assert list(rig.group.members.lines) == [line.line for line in rig.lines]
+
+
+@pytest.mark.parametrize("request_count", [1, 2])
+async def test_cancelled_request_is_an_outcome_and_a_cancelled_caller_is_not(
+    request_count: int,
+) -> None:
+    """A lost request cannot end what stops or disarms; who gives up waiting ends immediately."""
+    loop = asyncio.get_running_loop()
+    lost_requests: list[asyncio.Future[None]] = [loop.create_future() for _ in range(request_count)]
+    for request in lost_requests:
+        request.cancel()
+    endless_requests: list[asyncio.Future[None]] = [
+        loop.create_future() for _ in range(request_count)
+    ]
+    waiting = asyncio.ensure_future(outcomes(endless_requests))
+    await asyncio.sleep(0)  # until it waits
+
+    results = await outcomes(lost_requests)
+    waiting.cancel()
+    await asyncio.wait({waiting})
+
+    assert [type(result) for result in results] == [asyncio.CancelledError] * request_count
+    assert waiting.cancelled()

@@ -162,7 +162,7 @@ def steepest(lines: Iterable[tuple[complex, complex]], step: float, *, is_cosine
     return Slope(max_rise * factor, max_change * factor)
 
 
-@dataclass(slots=True)  # not frozen either
+@dataclass(slots=True)  # not frozen, as above
 class Voice:
     """A tone of a layer until it has faded."""
 

@@ -174,17 +174,7 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
 
 async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException]:
     """Await all requests to their ends; returns the result or the error of each."""
-    if len(requests) != 1:
-        return await asyncio.gather(*requests, return_exceptions=True)
-    try:  # without a task, which would take further iterations of the event loop
-        return [await requests[0]]
-    except asyncio.CancelledError as error:
-        caller = asyncio.current_task()
-        if caller is not None and caller.cancelling():
-            raise
-        return [error]  # only the request was cancelled
-    except Exception as error:
-        return [error]
+    return await asyncio.gather(*requests, return_exceptions=True)
 
 
 def last_fed_at(amplifier: Amplifier) -> float:

@@ -15,7 +15,7 @@ from model.finger import detection_threshold
 from model.structure.fingertips import fingertip_loads
 from model.table.fingertip_shapes import read_fingertips
 from model.table.table import LocalizationTable
-from model.transients.time_response import enveloped_accelerations
+from model.transients.enveloped_response import enveloped_accelerations
 
 _MAX_DISTANCE = 60.0  # Hz; of the tones that represent a drive
 _LEAST_SHARE = 1e-3  # minimum power of a tone, relative to the drive's strongest moments

@@ -6,7 +6,7 @@
 - Answers: level and contrast at random contacts, against the same solution with the fingers
   attached.
 - Answers in time: amplitudes at the fingertips after the pattern, started from rest on the plate in
-  time (`model.transients.time_response`), has settled. Contrast above 25 dB counts as 25 dB: in a
+  time (`model.transients.plate_in_time`), has settled. Contrast above 25 dB counts as 25 dB: in a
   null, hysteretic and viscous damping differ by more than the remaining vibration.
 - Promises: the felt contrast on 90 % of exactly solved plates (`model.study.exact_plates`).
 """
@@ -46,8 +46,8 @@ from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates, felt_on
 from model.table.table import LocalizationTable
 from model.transients.base_motion import ramped_onset
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.transients.shaping import SAMPLE_RATE, Transients
-from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes, tone_fields
 
 CONTENT_TOLERANCE = 1e-4

@@ -33,7 +33,7 @@ from model.switched_patterns import highest_levels
 from model.table.error_power import field_errors, mean_square_over_plate, with_position_errors
 from model.table.record import TableRecord
 from model.transients.excursions import MagnetMotions, Swing, share_along
-from model.transients.time_response import PlateInTime, plate_in_time
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes
 from registry.limits import GuardLimits
 

@@ -33,7 +33,7 @@ from model.structure.attachments import PointLoad, footprints_of
 from model.structure.sources import Source
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
-from model.transients.time_response import PlateInTime, plate_in_time
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 
 DECAYED = 0.25
 """Time [s] after which little is left of the magnets' free vibration."""

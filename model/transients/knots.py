@@ -32,7 +32,7 @@ from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray,
 from model.compiled.kernels import ShapedTone, Shaping, kernels, run_kernel
 from model.transients import base_motion
 from model.transients.base_motion import KNOT_STEP
-from model.transients.time_response import PlateInTime
+from model.transients.plate_in_time import PlateInTime
 
 _ComplexArray: TypeAlias = NDArray[np.complexfloating[Any, Any]]
 """Complex arrays of either precision."""

@@ -44,7 +44,7 @@ from model.transients.knots import (
     solve_carrier,
     steady_states,
 )
-from model.transients.time_response import ForcedVibration, PlateInTime
+from model.transients.plate_in_time import ForcedVibration, PlateInTime
 from model.vibration import Excitation, Tone, base_amplitudes
 
 ONSET_WINDOW = 0.100

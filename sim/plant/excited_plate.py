@@ -17,7 +17,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.sources import Source
 from model.transients.base_motion import Bases, ramped_onset, shaped
-from model.transients.time_response import from_rest
+from model.transients.sampled_response import from_rest
 from model.vibration import base_amplitudes
 from sim.plant.era_motions import harmonics_of_layer, realised
 from sim.plant.fingers import FingerRecord

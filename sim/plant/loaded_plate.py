@@ -18,7 +18,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.structure.attachments import PointLoad
 from model.structure.fingertips import FingertipLoad
 from model.structure.sources import Source
-from model.transients.time_response import PlateInTime, plate_in_time
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 
 TABLE_ROWS = 512
 """Samples per table of exponentials; a power of 2."""

@@ -1,7 +1,7 @@
 """The plate in the time domain, advanced from one change of drive or contacts to the next.
 
 There is no step size. Between changes the motion is a sum of free vibrations, which decay, and of
-forced ones (`model.transients.time_response`); every change adds free vibrations that keep
+forced ones (`model.transients.plate_in_time`); every change adds free vibrations that keep
 displacement and velocity continuous.
 """
 
@@ -18,7 +18,7 @@ from model.structure.attachments import PointLoad
 from model.structure.fingertips import FingertipLoad
 from model.structure.sources import Source
 from model.transients.base_motion import BaseMotions, Motion
-from model.transients.time_response import ForcedVibration
+from model.transients.plate_in_time import ForcedVibration
 from sim.plant.loaded_plate import (
     LoadedPlate,
     LoadedPlateCache,

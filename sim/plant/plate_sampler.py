@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.transients.time_response import ForcedVibration
+from model.transients.plate_in_time import ForcedVibration
 from sim.plant.loaded_plate import TABLE_ROWS, LoadedPlate, exponentials
 
 _NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of its rounding error

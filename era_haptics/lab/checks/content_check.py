@@ -30,7 +30,7 @@ from model.quantities import percent, percent_down
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP, rise
-from model.transients.time_response import from_rest
+from model.transients.sampled_response import from_rest
 from model.vibration import base_amplitudes
 
 TOLERANCE_DB = 3.0

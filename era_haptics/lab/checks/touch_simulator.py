@@ -21,8 +21,8 @@ from model.finger import decibels, fingertip_points, fingertip_weights, over_thr
 from model.structure.fingertips import fingertip_loads
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.transients.shaping import SAMPLE_RATE, Transients
-from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import base_amplitudes
 
 STEADY_AFTER = 0.3

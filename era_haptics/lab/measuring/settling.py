@@ -11,7 +11,7 @@ from era_haptics.lab.measuring.multisine import PERIOD
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
-from model.transients.time_response import plate_in_time
+from model.transients.plate_in_time import plate_in_time
 
 MIN_SETTLING = 1.0
 """Minimum settling time [s] of a run; a plate with a typical loss factor has settled."""

@@ -27,8 +27,8 @@ from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.table_file import build_table, save_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
+from model.transients.plate_in_time import plate_in_time
 from model.transients.shaping import Transients
-from model.transients.time_response import plate_in_time
 
 PUBLISHED = {
     6.3: 0.727, 8: 0.873, 10: 0.951, 12.5: 0.958, 16: 0.896, 20: 0.782, 25: 0.647, 31.5: 0.519,

@@ -11,7 +11,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
-from model.transients.time_response import PlateInTime, plate_in_time
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 
 
 def make_plate_in_time(*, frequency_max: float = 500.0) -> tuple[Rig, PlateInTime]:

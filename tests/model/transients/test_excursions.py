@@ -27,6 +27,7 @@ from model.structure.fingertips import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.statics import rigid_body_frequencies
 from model.table.table_file import build_table
 from model.transients.base_motion import shaped
+from model.transients.enveloped_response import enveloped_accelerations
 from model.transients.excursions import (
     CLICKS_APART,
     MagnetMotions,
@@ -39,14 +40,10 @@ from model.transients.excursions import (
 from model.transients.knots import (
     steady_states,
 )
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.transients.reach import reach_of
+from model.transients.sampled_response import from_rest
 from model.transients.shaping import Shaper, Transients
-from model.transients.time_response import (
-    PlateInTime,
-    enveloped_accelerations,
-    from_rest,
-    plate_in_time,
-)
 from model.vibration import Tone
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -30,8 +30,8 @@ from model.transients.base_motion import (
     shaped,
 )
 from model.transients.knots import ONSET_KNOTS, bounded_minimum, hat_accelerations, steady_states
+from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.transients.shaping import SAMPLE_RATE, Shaper, Transients
-from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, Tone
 from tests.model.transients.stepped_plate import make_plate_in_time, stepped_acceleration
 

@@ -26,8 +26,8 @@ from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.fingertips import Fingertip
 from model.transients.base_motion import BaseEnvelope, shaped
+from model.transients.plate_in_time import plate_in_time
 from model.transients.shaping import Transients
-from model.transients.time_response import plate_in_time
 from model.vibration import Tone as VibrationTone
 from sim.amplifier.amplifier_clock import StraightClock
 from sim.bench.bench import Bench

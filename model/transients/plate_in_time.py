@@ -6,23 +6,12 @@ q are the coordinates of the reduced free plate and the displacements of the pha
 it, phi the shapes at an ERA, and y the motion of the ERA's base. `model.reduction.supported_plate`
 defines M, C and K. For exciters, y is the voltage, k_b and c are the forces between plate and
 magnet due to y and y', and q includes the displacements of their magnets. The first-order system is
-diagonalized once for each set of attachments. There are three kinds of drives, all without a step
-size, so that no error grows with time:
+diagonalized once for each set of attachments.
 
-- Bases that move in terms with closed-form solutions (`model.transients.base_motion`):
-  `PlateInTime.driven`.
-- Samples of band-limited signals, from rest: `from_rest`. Between samples a signal is the
-  trigonometric polynomial through them, with a closed-form solution for each sinusoid; a free
-  vibration makes up for their sum at time 0.
-- An envelope, on a plate under fingers: `enveloped_accelerations`, a numerical Laplace transform.
-  The modes under fingers would take as long as several answers of a table. At a complex frequency s
-  fingers are a change of low rank of the plate on its ERAs, whose modes are known: with
-  displacements u0 of weightless fingers, receptances G between them and dynamic stiffness D, they
-  hold the plate by the forces (1 + D G)^-1 D u0. The demodulated response less its quasi-static
-  part, which a slow envelope would give, is inverted on the line s = i omega + sigma + i nu by a
-  discrete Fourier transform; the response after the end of the period wraps around, attenuated by
-  exp(-sigma period). For long envelopes the plate is solved every half hertz, with linear
-  interpolation, up to where smooth envelopes have a spectrum, which is ended along a raised cosine.
+There are three kinds of drives, all without a step size, so that no error grows with time: bases
+that move in terms with closed-form solutions (`PlateInTime.driven`), samples of band-limited
+signals (`model.transients.sampled_response`), and envelopes on a plate under fingers
+(`model.transients.enveloped_response`).
 
 Not modeled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
 rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
@@ -36,16 +25,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
-from model.arrays import Complex64Array, ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate
 from model.reduction.supported_plate import modal_matrices, stretches
-from model.structure.attachments import PointLoad, coupled_forces, footprints_of
-from model.structure.fingertips import Fingertip, FingertipLoad
+from model.structure.attachments import PointLoad, footprints_of
+from model.structure.fingertips import FingertipLoad
 from model.structure.sources import Source
-from model.transients.base_motion import BaseMotions, rise
+from model.transients.base_motion import BaseMotions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -343,161 +331,3 @@ def _inverse(vectors: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(vectors))
     except np.linalg.LinAlgError:
         return np.full_like(vectors, np.nan)
-
-
-_BATCH = 512  # frequencies or samples per batch, some kilobytes each
-
-
-def from_rest(
-    plate: PlateInTime,
-    signals: FloatArray,
-    shapes: FloatArray,
-    *,
-    sample_rate: float,
-    factors: ComplexArray,
-) -> FloatArray:
-    """Return the acceleration (n, p) [m/s²] from rest, at the times of samples from time 0 on.
-
-    signals (eras, n) in full strokes, sampled at sample_rate [Hz]; shapes (p, r) of the reduced
-    plate at points; factors (eras,): gain and phase of each ERA. Displacement and velocity of the
-    plate are 0 at time 0: a base that jumps there passes on no impulse, like a ramp of 0.
-    """
-    count = signals.shape[1]
-    continued = _continued(signals)
-    period = continued.shape[1]
-    spectrum: ComplexArray = factors * np.fft.rfft(continued).T
-    s = np.asarray(2j * np.pi * np.fft.rfftfreq(period, 1 / sample_rate), dtype=np.complex128)
-    points = plate.with_far_ends(shapes)
-    forced_shapes = (points @ plate.displacement).T
-    free_shapes = (points @ plate.free_acceleration).T
-    forced = np.empty((len(s), len(points)), dtype=complex)
-    start = np.zeros(len(plate.eigenvalues), dtype=complex)
-    for first in range(0, len(s), _BATCH):
-        batch = slice(first, first + _BATCH)
-        z = plate.following_all(s[batch], spectrum[batch])
-        forced[batch] = s[batch, None] ** 2 * (z @ forced_shapes)
-        counted_twice = z[0] if first == 0 else 0  # 0 Hz has no conjugate
-        start += 2 * z.sum(axis=0) - counted_twice
-    free = -plate.to_free @ (plate.vectors @ start).real / period
-    ringing = list[FloatArray]()
-    for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _BATCH):
-        decays = np.exp(np.outer(times, plate.decay))
-        ringing.append(((free * decays) @ free_shapes).real)
-    return np.asarray(np.fft.irfft(forced, period, axis=0)[:count] + np.concatenate(ringing))
-
-
-def _continued(signals: FloatArray) -> FloatArray:
-    """Continue signals (eras, n) from their last samples and fade them to rest, (eras, 2 n - 1).
-
-    The continuation has no effect on earlier times; a jump would show between samples. An odd
-    number of samples has no frequency at half their rate.
-    """
-    count = signals.shape[1]
-    onward = 2 * signals[:, -1:] - signals[:, -2::-1]
-    fading = 1 - rise(np.arange(1.0, count), count)
-    return np.hstack([signals, fading * onward])
-
-
-_DAMPING = 5.0  # sigma times the period
-
-_RESOLUTION, _LONG_BAND = 0.5, 80.0  # Hz; for long envelopes, the band to each side
-
-_GUARD = 12
-"""Steps after the end that are computed and left out.
-
-Because spectra are cut off, the plate seems to ring before a jump at the start. This ringing wraps
-around to the end, where the errors are largest.
-"""
-
-
-def enveloped_accelerations(
-    plate: PlateInTime,
-    bases: ComplexArray,
-    frequency: float,
-    *,
-    points: FloatArray,
-    fingers: Sequence[tuple[FloatArray, Fingertip]],
-    envelope: FloatArray,
-    step: float,
-) -> ComplexArray:
-    """Return demodulated accelerations (n + 1, p) [m/s²] along an envelope from rest, then steady.
-
-    At the times of the envelope, whose values (n,) are a step [s] apart. plate: without fingers;
-    bases (eras,): motions [m] at a frequency [Hz], which the envelope multiplies; points (p, r):
-    shapes; fingers: shape (r,) under each and its load.
-    """
-    padded = np.pad(envelope, (0, _GUARD))
-    count = len(padded)
-    period = count * step
-    growth = np.exp(_DAMPING / count * np.arange(count))
-    spectrum = np.fft.fft(padded / growth)
-    nu = np.fft.fftfreq(count, step)
-    lines = np.sort(nu)
-    if 1 / period < _RESOLUTION:
-        lines = np.arange(-_LONG_BAND, _LONG_BAND + _RESOLUTION, _RESOLUTION)
-    s = np.asarray(2j * math.pi * (frequency + np.append(lines, 0.0)), dtype=complex)
-    s[:-1] += _DAMPING / period
-    response = _response_under_fingers(plate, s, bases, frequency, points, fingers)
-    steady = response[-1]
-    tapered = np.minimum(1 - np.abs(lines / lines[0]), 0.5)
-    taper = np.sin(np.pi * tapered) ** 2
-    transient = ((response[:-1] - steady) * taper[:, None]).astype(np.complex64)
-    is_in_band = np.abs(nu) <= lines[-1]
-    transient_spectrum = np.zeros((count, len(steady)), dtype=np.complex64)
-    transient_spectrum[is_in_band] = spectrum[is_in_band, None].astype(np.complex64) * (
-        _between_lines(lines, transient, nu[is_in_band])
-    )
-    accelerations = fft.ifft(transient_spectrum, axis=0) * growth[:, None].astype(np.float32)
-    accelerations += padded[:, None].astype(np.float32) * steady.astype(np.complex64)
-    return np.append(accelerations[: len(envelope)], steady[None], axis=0)
-
-
-def _between_lines(
-    lines: FloatArray, values: Complex64Array, frequencies: FloatArray
-) -> Complex64Array:
-    """Interpolate values (l, p) at ascending lines (l,) linearly at frequencies (n,), (n, p)."""
-    upper = np.clip(np.searchsorted(lines, frequencies), 1, len(lines) - 1)
-    lower = upper - 1
-    share = (lines[upper] - frequencies) / (lines[upper] - lines[lower])
-    lower_share = share.astype(np.float32)[:, None]
-    between: Complex64Array = lower_share * values[lower] + (1 - lower_share) * values[upper]
-    return between
-
-
-def _response_under_fingers(
-    plate: PlateInTime,
-    s: ComplexArray,
-    bases: ComplexArray,
-    frequency: float,
-    points: FloatArray,
-    fingers: Sequence[tuple[FloatArray, Fingertip]],
-) -> ComplexArray:
-    """Return accelerations (m, p) at complex frequencies s (m,) by bases (eras,), under k fingers.
-
-    Displacements are computed together for all sources (the bases' drives, their rates and a unit
-    force at each finger) at the points and at the fingers.
-    """
-    point_count = len(points)
-    finger_count = len(fingers)
-    gains = np.array([era.gain(np.array(frequency)) for era in plate.eras], dtype=complex)
-    driven = np.array([gains * bases * plate.by_drive, gains * bases * plate.by_rate])
-    finger_shapes = [shape for shape, _ in fingers]
-    shapes = plate.with_far_ends(np.vstack([points, *finger_shapes]))
-    modal_shapes = (shapes @ plate.displacement).astype(np.complex64)  # (p + k, 2 r)
-    by_bases = (driven @ plate.participation.T).astype(np.complex64)  # (2, 2 r)
-    by_fingers = (shapes[point_count:] @ plate.forced.T).astype(np.complex64)  # (k, 2 r)
-    sources = np.concatenate([by_bases, by_fingers])
-    residues = sources[:, None] * modal_shapes
-    poles = (1 / (s[:, None] - plate.eigenvalues)).astype(np.complex64)
-    displacements_by_source = poles @ residues.reshape(-1, modal_shapes.shape[1]).T
-    by_source = displacements_by_source.reshape(len(s), len(sources), len(shapes)).astype(complex)
-    by_drive = by_source[:, 0] + s[:, None] * by_source[:, 1]
-    displacements = by_drive[:, :point_count]
-    if finger_count:
-        stiffness = np.column_stack([tip.dynamic_stiffness(-1j * s) for _, tip in fingers])
-        receptance = by_source[:, 2:, point_count:].swapaxes(1, 2)
-        applied = (stiffness * by_drive[:, point_count:])[:, :, None]
-        forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]  # (m, k)
-        prevented = (forces[:, None] @ by_source[:, 2:, :point_count])[:, 0]
-        displacements = displacements - prevented
-    return np.asarray(displacements * (s**2)[:, None])

@@ -37,7 +37,7 @@ from controller.play.selected_contents import (
     Selection,
     judged,
     not_served,
-    own_level_db_sl,
+    reaches_threshold,
 )
 from controller.play.shared_capabilities import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
@@ -413,7 +413,7 @@ def _why_unfelt(sensation: Sensation) -> str | None:
         return None
     if stimulus.is_limit and sensation.level_db_sl <= 0:
         return NEIGHBORS_LEAVE_NOTHING
-    if own_level_db_sl(sensation) < 0 <= stimulus.level_db_sl:
+    if stimulus.level_db_sl >= 0 and not reaches_threshold(sensation):
         return LIMITS_LEAVE_NOTHING
     return None
 

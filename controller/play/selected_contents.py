@@ -15,7 +15,16 @@ import numpy as np
 
 from controller.play.intent import FingerTarget, Gains, Pulse, Target, Targets, pulses_of
 from controller.sources.touch import Contact, ContactKey
-from model.answer.answer import HELD_BACK, MIXED, OWN, SHARED, Layer, Sensation, verdict_of
+from model.answer.answer import (
+    HELD_BACK,
+    MIXED,
+    OWN,
+    SAME_LEVEL,
+    SHARED,
+    Layer,
+    Sensation,
+    verdict_of,
+)
 from model.answer.envelope import Course
 from model.answer.stimulus import Finger, Placement
 from model.finger import detection_threshold, fingertips_on
@@ -53,6 +62,11 @@ def own_level_db_sl(sensation: Sensation) -> float:
     if stimulus is None or stimulus.duration is None:
         return sensation.promised_level_db_sl
     return sensation.level_db_sl
+
+
+def reaches_threshold(sensation: Sensation) -> bool:
+    """Whether a finger's content reaches 0 dB SL, within the rounding of levels."""
+    return own_level_db_sl(sensation) >= -SAME_LEVEL
 
 
 def judged(sensation: Sensation, *, is_apart: bool) -> Sensation:
@@ -117,7 +131,7 @@ def weakened(sensation: Sensation, gain_db: float, others_gain_db: float) -> Sen
         promised_contrast_db=_amplified(sensation.promised_contrast_db, contrast_gain),
         foreign_levels_db_sl=_all_amplified(sensation.foreign_levels_db_sl, others_gain_db),
     )
-    if own_level_db_sl(weaker) < 0 <= own_level_db_sl(sensation):
+    if reaches_threshold(sensation) and not reaches_threshold(weaker):
         return replace(weaker, verdict=HELD_BACK)
     return weaker
 

@@ -528,3 +528,16 @@ def test_promise_for_a_way_is_restated_once_the_finger_rests() -> None:
         for selection in (restated, landed)
     ]
     assert promises[0] == pytest.approx(promises[1], abs=0.1)
+
+
+def test_level_at_the_threshold_is_played_at_every_position() -> None:
+    """Rounding must not hold back 0 dB SL: a detection experiment plays levels around it."""
+    unserved = []
+    for x in np.linspace(0.03, 0.27, 9):
+        for y in np.linspace(0.03, 0.2, 7):
+            key = ContactKey("panel", 1)
+            target = Target(key, 0.0)
+            selection = choose_for([(Contact(key, float(x), float(y), 0.0), target)], playable())
+            if not selection.contents:
+                unserved.append((x, y, selection.reason))
+    assert unserved == []

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --editable
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants rename-test kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test qemu-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants rename-test kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
 	bench-promise dist kernels smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -26,6 +26,11 @@ firmware:
 firmware-test: .venv/installed-test
 	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi:
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)
+
+# Full conformance of the firmware on an emulated microcontroller, on its serial and its Modbus RTU line.
+qemu-test: .venv/installed-test
+	.ci/install qemu-system-arm:qemu-system-arm gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi:
+	$(BIN)/python tests/programs/emulated_board.py
 
 # First the tests that mostly compute, then those that play in real time, from the files that name them.
 # Each with one worker more than there are processors: some tests wait for processes. More workers make
@@ -45,7 +50,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, in at most three hours; the results are in
 # out/nightly/page.md. Others: make nightly NIGHTLY='soak kill-test', or NIGHTLY_OPTIONS=--report
-NIGHTLY := test-long test-kernels test-pymodbus test-busy faults mutants rename-test firmware-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults mutants rename-test firmware-test qemu-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
 nightly: .venv/installed-test
 	$(BIN)/python tests/programs/nightly.py $(NIGHTLY) $(NIGHTLY_OPTIONS)
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
-// The dozen functions that a board must give; all of them return at once, but for `board_wait`.
-// They are called from the main loop alone (loop.c). See README.md, "To another board".
+// The 14 functions of a board. All return immediately, except `board_wait`. Only the main loop (loop.c)
+// calls them. See README.md, "Port to another board".
 
 #ifndef BOARD_H
 #define BOARD_H
@@ -27,12 +27,14 @@ void board_wait(void);
 
 // Lines.
 
-// The next byte that has arrived, or -1.
+// The next byte that has arrived, or -1. A ring of 512 bytes is enough in each direction: the longest
+// request and reply have 256.
 int board_read(enum line line);
-// Begin to send; the bytes are copied.
+// Begin to send; the bytes are copied. If they do not fit, none of them is sent.
 void board_write(enum line line, const uint8_t *bytes, uint16_t length);
-// Microseconds since the byte read last arrived: Modbus RTU ends its frames with silence, and Mark
-// keeps the clock of a byte (with the feature, of every line, by the time stamp of an interrupt).
+// Microseconds since the byte that was read last arrived; later bytes may be waiting. The interrupt
+// that receives a byte stores its time with it. Silence ends a frame of Modbus RTU, and Mark stores
+// the clock at its last byte.
 uint32_t board_silence(enum line line);
 
 // High voltage, and what is measured.

@@ -109,23 +109,6 @@ def test_layer_at_level_zero_is_silent_once_its_ending_is_over(valid_for: int, e
     assert playback.ends_by == pytest.approx(end)
 
 
-def test_playback_starts_no_voice_from_one_that_faded_while_time_did_not_advance() -> None:
-    """The onset to level 0 ends at 20 ms; the waiting set starts at 40 ms, with the other onset."""
-    playback = Playback(2, 8)
-    short_onset = Envelope(100, ((2000, 0),))  # two steps of 10 ms
-    long_onset = Envelope(200, ((2000, 0),))  # two steps of 20 ms
-    silent_tone = tone(100.0, 0.0, onset=short_onset)
-    lasting_tone = tone(100.0, 0.5, channel=1, onset=long_onset)
-    playback.commit([layer(silent_tone, lasting_tone, ramp=0.02)], 1, 0.0)
-    waiting = layer(tone(100.0, 0.5, keep_phase=True), ramp=0.02, after=True)
-    playback.commit([waiting], 2, 0.01)
-
-    playback.advance(1.0)
-
-    (voice,) = playback.all_voices[0]
-    assert voice.began == pytest.approx(0.04)
-
-
 def test_playback_level_adds_tones_of_one_frequency_by_their_phases() -> None:
     """Tones of 0.3, 0.4i and -0.3 at 99.95 Hz interfere, whenever they began; others do not."""
     playback = Playback(1, 8)
@@ -165,30 +148,6 @@ def test_uncertain_playback_is_ambiguous_while_another_layer_may_end() -> None:
     assert not playback.is_ambiguous(Interval(0.161, 0.17), [new_layer])
 
 
-def test_uncertain_playback_bounds_a_layer_that_may_have_ended_when_a_set_arrives() -> None:
-    """The first layer ends within 100 to 160 ms, although a set arrives at 131 to 133 ms."""
-    playback = UncertainPlayback(Playback(2, 8))
-    playback.commit([layer(tone(110.0, 0.5), valid_for=0.1)], 1, Interval(0.0, 0.06))
-
-    new_layer = layer(tone(20.0, 0.5, channel=1), number=1)
-    playback.commit([new_layer], 2, Interval(0.131, 0.133))
-
-    assert playback.bounds(0, 0.134, 0.136) == pytest.approx((0.0, 0.5))
-    assert playback.bounds(0, 0.161, 0.162) == (0.0, 0.0)
-
-
-def test_uncertain_playback_adds_up_tones_that_may_cancel() -> None:
-    """Three tones of 0.3 at 110 Hz add up to 0 or to 0.9; 0.5 at 20 Hz remains in any case."""
-    playback = UncertainPlayback(Playback(2, 8))
-    playback.commit([layer(tone(20.0, 0.5), number=0)], 1, Interval(0.0, 0.001))
-    for number, phase in enumerate((0.0, 120.0, -120.0), 1):
-        start = Interval(0.1 * number, 0.1 * number + 0.001)
-        playback.commit([layer(tone(110.0, 0.3, phase=phase), number=number)], 1 + number, start)
-
-    assert playback.bounds(0, 1.0, 1.01) == pytest.approx((0.5, 1.4))
-    assert playback.bounds(0, 1.0, 1.01, is_exact=True) == pytest.approx((0.5, 0.5))
-
-
 def test_uncertain_playback_bounds_are_no_wider_than_a_ramp_requires() -> None:
     """A rise to 0.5 in 100 ms, begun within 2 ms, is at 0.25 +/- 0.00786 after half of the time.
 
@@ -204,20 +163,6 @@ def test_uncertain_playback_bounds_are_no_wider_than_a_ramp_requires() -> None:
 
     playback.commit([layer(tone(110.0, 0.5, keep_phase=True))], 2, Interval(0.2, 0.21))
     assert playback.bounds(0, 0.22, 0.23) == pytest.approx((0.5, 0.5))
-
-
-def test_expected_outputs_are_unknown_while_a_layer_may_end_just_before_a_silence() -> None:
-    """The layer ends within 100 to 112 ms; from 110 ms on all fade for 50 ms."""
-    amplifier = OutputObserver()
-    ending_layer = layer(tone(110.0, 0.5, ending=Envelope(10, ())), valid_for=0.1)
-    amplifier.play(ending_layer, 1, Interval(0.0, 0.01))
-
-    amplifier.expected.silence(Interval(0.11, 0.112), 0.05, "Disarm")
-
-    assert not amplifier.knows_layer_0(0.113)
-    assert amplifier.knows_layer_0(0.17)
-    amplifier.show_level(0.1, 0.17)
-    assert amplifier.broken_rules == ["silent"]
 
 
 FLAT_40_MS = Envelope(100, ((5000, 0),) * 3)
@@ -243,22 +188,6 @@ def test_expected_outputs_are_unknown_while_a_silence_may_overtake_an_ending(
     assert amplifier.knows_layer_0(1.06)
     amplifier.show_level(0.1, 1.06)
     assert amplifier.broken_rules == ["silent"]
-
-
-@pytest.mark.parametrize(("arrival", "is_known"), [(1.01, True), (1.02, False), (1.03, True)])
-def test_expected_outputs_are_unknown_while_a_set_may_overtake_an_onset_to_silence(
-    arrival: float, is_known: bool
-) -> None:
-    """An onset to level 0 and the ramp of a set overlap as in the test above."""
-    amplifier = OutputObserver()
-    amplifier.play(layer(tone(110.0, 0.0, onset=FLAT_40_MS)), 1, at(1.0))
-
-    amplifier.play(layer(ramp=0.02), 2, Interval(arrival, arrival + 0.0005))
-
-    assert amplifier.knows_layer_0(arrival + 0.003) == is_known
-    assert amplifier.knows_layer_0(1.06)
-    amplifier.show_level(0.1, 1.06)
-    assert amplifier.broken_rules == ["plays"]
 
 
 def test_playback_of_random_sets_never_jumps_and_stays_below_its_peak() -> None:

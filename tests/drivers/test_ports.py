@@ -6,8 +6,6 @@ import errno
 import os
 import pty
 import socket
-import subprocess
-import sys
 import termios
 import tty
 from collections.abc import Iterator
@@ -239,23 +237,3 @@ async def test_host_addresses_keep_the_zone_of_a_link_local_address(
     names = await ports.host_addresses("amplifier.test")
 
     assert names == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
-
-
-def test_program_ends_while_a_host_name_is_still_being_resolved() -> None:
-    """Even if the name server does not reply."""
-    program = """
-import asyncio, socket, threading
-from drivers import ports
-from drivers.errors import LinkError
-
-socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()
-ports.CONNECT_TIMEOUT = 0.05
-try:
-    asyncio.run(ports.open_connection("amplifier.test", 502, lambda _: None, lambda _: None))
-except LinkError as problem:
-    print(problem)
-"""
-    completed = subprocess.run(
-        [sys.executable, "-c", program], check=True, timeout=60, capture_output=True, text=True
-    )
-    assert "amplifier.test:502: no connection" in completed.stdout

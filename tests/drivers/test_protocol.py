@@ -15,30 +15,23 @@ from unittest.mock import Mock
 
 import pytest
 
-from amplifier_eds import eds_text
 from drivers import trace
 from drivers.by_hand.rows import status_rows
 from drivers.errors import CommandError
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
     BY_NUMBER,
-    IDENTITY,
-    MAX_WORDS,
     MESSAGES,
     QUANTITIES,
     STAGED_LIFE,
-    status_reading,
 )
 from drivers.protocol.definition import STATUS as STATUS_RECORD
 from drivers.protocol.records import Number, Record, Refusal, Values, WireQuantity
 from drivers.protocol.sets import Assembly, is_last, pack_layers, parts, unpack_layers
 from drivers.trace import Direction, TraceWriter, tracing
 from drivers.wires.wire import address_of
-from firmware_records import records_header
 from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time
-from kit.judged_lines import judged
 from processes.interrupted import full_disk
-from protocol_tables import records
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.canopen_objects import ObjectServer, SdoAbort
 from tests.drivers.protocol_editions import LATER, WORD
@@ -72,13 +65,6 @@ _OLDER = 11 + 4 + 8 + len(_UNSTATED)
 """Words of 4 channels and 8 layers."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_conformance_takes_another_edition(kind: str, age: str) -> None:
-    """Additional words, or fewer words, break no rule."""
-    checks = "capabilities", "starts_disarmed", "areas", "present_areas", "objects", "lengths"
-    assert {result.result for result in judged(kind, checks)} == {"passed"}
-
-
 def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
     """The objects of 4 channels and 8 layers, and the added one under the next subindex."""
     objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
@@ -91,28 +77,6 @@ def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
     else:
         assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER + 1])
         assert int.from_bytes(objects.read(0x2002, _OLDER + 1, 0.0), "little") == WORD
-
-
-@pytest.mark.parametrize("age", ["same"], indirect=True)
-def test_pages_and_files_have_what_is_added(age: str) -> None:
-    """It is last in its row, in the sheet and in the firmware's status."""
-    assert " · later_voltage (added) |" in records()
-    assert f"[2002sub{_OLDER + 1:X}]\nParameterName=later_voltage\n" in eds_text()
-    readings, _, put = records_header().partition("put_status(")
-    assert "readings.later_voltage);\n}" in put
-    assert "uint16_t later_voltage; // 0.01 V; 1 is -12 V, " in readings
-    assert "#define WORD_OF_LATER_VOLTAGE(value) ((value) * 100 + 1201)\n" in readings
-
-
-@pytest.mark.parametrize(
-    ("word", "volts"), [(0, None), (1, -12.0), (1201, 0.0), (1202, 0.01), (7201, 60.0)]
-)
-def test_reading_that_is_added_may_be_zero_or_less(word: int, volts: float | None) -> None:
-    """Steps count from the lowest value, which is 1; both ends agree."""
-    assert LATER.in_unit(Record(LATER).unpack([word], is_strict=True)) == volts
-    assert volts is None or LATER.quantity.to_wire(volts) == word
-    with pytest.raises(CommandError, match="-12 to 60 V"):
-        LATER.quantity.to_wire(-12.01)
 
 
 def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
@@ -134,19 +98,6 @@ def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
         record.unpack([7, 0x8001, 0], is_strict=False)
     with pytest.raises(ValueError, match=r"begin at 1.*got 0.*the zero 1,"):
         Number("flags", QUANTITIES["flags"], is_added=True)
-
-
-def test_places_of_words_are_those_of_the_page() -> None:
-    """Eleven words precede the levels, three the stream of a set (protocol.md)."""
-    assert (
-        STATUS_RECORD.places["token"],
-        STATUS_RECORD.places["layers"],
-        STATUS_RECORD.words,
-    ) == (9, 10, 11)
-    part = MESSAGES["Set"].request
-    assert (part.places["now"], part.words) == (2, 3)
-    caps = MESSAGES["GetCaps"].reply
-    assert (caps.places["envelope_step_max"], caps.words) == (17, 19)
 
 
 def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
@@ -353,29 +304,6 @@ STATUS: Values = {
     },
     **{"levels": [2000, 0, 0, 10000], "tokens": [513, 0]},
 }
-NOT_STATED = dict.fromkeys(entry.name for entry in STATUS_RECORD.added)
-"""What later editions add."""
-STATUS_WORDS = [
-    *(4, 0, 1, 0, 250, 0xFFCB, 1800, 1, 2, 513, 0x0402),
-    *(2000, 0, 0, 10000, 513, 0),
-]
-
-
-def test_status_has_the_words_written_by_hand() -> None:
-    """State to token, both counts in one word, levels, tokens; -5.3 °C in two's complement."""
-    record = MESSAGES["GetStatus"].reply
-    assert record.pack(STATUS) == STATUS_WORDS
-    assert record.unpack(STATUS_WORDS, is_strict=True) == {**NOT_STATED, **STATUS}
-
-
-def test_long_numbers_and_texts_have_the_high_part_first() -> None:
-    """65.536 s is 0001 0000; "A-1" is 3, 412D, 3100."""
-    fault = {"count": 1, "faults": [{"fault": 4, "channel": 2, "age": 65536}]}
-    assert MESSAGES["GetFaults"].reply.pack(fault) == [1, 4, 2, 1, 0]
-    texts = {"versions": 8, "vendor": "A-1", "product": "", "serial_number": "é", "firmware": ""}
-    words = [8, 3, 0x412D, 0x3100, 0, 2, 0xC3A9, 0]
-    assert IDENTITY.pack(texts) == words
-    assert IDENTITY.unpack(words, is_strict=True) == texts
 
 
 def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> None:
@@ -385,15 +313,6 @@ def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> Non
     assert (speed.decimals, Number("count", QUANTITIES["count"]).decimals) == (2, 0)
     with pytest.raises(ValueError, match=r"unit of fan_speed .* rpm, got /min"):
         WireQuantity("fan_speed", "u16", 20, "/min", 1, 65535)
-
-
-@pytest.mark.parametrize(("low", "high"), [(0, 65535), (-1, 65534), (-32768, 32767)])
-def test_added_reading_that_fills_a_word_is_refused(low: int, high: int) -> None:
-    """With 0 for not stated it needs two words; one value less, or a start at 1, needs one."""
-    with pytest.raises(ValueError, match=f"later must be from {low} to {high - 1}, "):
-        status_reading("later", "of it", low, high, 10, "V", is_added=True)
-    for first, last in ((low, high - 1), (1, 65535)):
-        assert status_reading("later", "of it", first, last, 10, "V", is_added=True).words == 1
 
 
 @pytest.mark.parametrize(
@@ -415,23 +334,6 @@ def test_request_that_no_host_may_send_is_refused(name: str, words: list[int], c
     with pytest.raises(Refusal) as caught:
         MESSAGES[name].request.unpack(words, is_strict=True)
     assert caught.value.code == code
-
-
-def test_longest_messages_fit_every_wire() -> None:
-    """Sixteen channels and sixteen layers, the widest that an amplifier can have."""
-    limits = {"frequency_min": 0, "frequency_max": 1, "level_max": 1}
-    zeros = dict.fromkeys(MESSAGES["GetCaps"].reply.names, 1)
-    widest = zeros | {
-        "layers": 4,
-        "voices": 8,
-        "set_words": 512,
-        "watchdog_min": 100,
-        "watchdog_max": 100,
-    }
-    caps = widest | {"channels": 16, "limits": [limits] * 16}
-    assert len(MESSAGES["GetCaps"].reply.pack(caps)) <= MAX_WORDS
-    status = STATUS | {"channels": 16, "layers": 16, "levels": [0] * 16, "tokens": [0] * 16}
-    assert len(MESSAGES["GetStatus"].reply.pack(status)) <= MAX_WORDS
 
 
 def test_random_words_are_read_or_refused() -> None:

@@ -16,7 +16,6 @@ from drivers.wires import wire
 from drivers.wires.serial_line import SerialAddress
 from drivers.wires.wire import line_kind_of
 from registry.limits import GuardLimits
-from sim.transport.simulated_line import LINE_KINDS, PROMPT
 
 BUS = "can+socketcan://can0"
 LIMITS = GuardLimits(40.0, 250.0, 1.0)
@@ -152,14 +151,6 @@ def test_arrangement_suggests_only_improvements() -> None:
     assert "clock_error" in inexact.remedy
 
 
-def test_arrangement_without_a_steerable_clock_has_an_infinite_error() -> None:
-    """The other amplifier has the errors of its clock and its line."""
-    arrangement = arrange("serial:///dev/ttyS0", "serial:///dev/ttyS1", stated=[5e-6, math.inf])
-
-    expected = math.hypot(STATED, CLOCK_ERRORS["native"])
-    assert arrangement.errors == {"a": pytest.approx(expected), "b": math.inf}
-
-
 @pytest.mark.parametrize(
     ("second_url", "second_channels"),
     [("serial:///dev/ttyUSB1", 0), ("serail:///dev/ttyUSB0", 4)],
@@ -169,11 +160,6 @@ def test_one_amplifier_with_channels_has_no_arrangement(
 ) -> None:
     """The second amplifier has no channels, or a URL that is an error elsewhere."""
     assert arrange("serial:///dev/ttyUSB0", second_url, channels=[4, second_channels]) is None
-
-
-def test_every_simulated_kind_of_line_has_a_clock_error() -> None:
-    """The names agree, so that a simulation measures what the check states."""
-    assert CLOCK_ERRORS.keys() == {*LINE_KINDS, PROMPT}
 
 
 def test_kind_of_line_is_stated_or_follows_from_scheme_or_port(

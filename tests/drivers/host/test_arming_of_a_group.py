@@ -376,12 +376,3 @@ async def test_full_level_must_have_the_kind_that_the_rig_states(wire: str) -> N
     host.identification.is_output = False
     with pytest.raises(LinkError, match="full level"):
         await host.open()
-
-
-@on_wires()
-async def test_doubled_reply_is_not_taken_for_two_amplifiers(wire: str) -> None:
-    """The replies of one amplifier arrive twice while it is identified."""
-    rig = await connect("a", wire=wire, is_armed=False)
-    rig.line.outward = lambda _, data: [(0.0002, data), (0.004, data)]
-
-    await rig.hosts["a"].open()

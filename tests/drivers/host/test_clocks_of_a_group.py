@@ -24,7 +24,6 @@ from tests.drivers.host.group_on_lines import (
     SILENT,
     Rig,
     begin,
-    connect,
     layer,
     tone,
 )
@@ -213,26 +212,6 @@ async def test_clocks_are_steered_when_the_group_is_armed(lines: str) -> None:
     assert rms(skews) < rms(stated_errors)
 
 
-@pytest.mark.parametrize(
-    ("kind", "seed", "bound"),
-    [pytest.param("usb-full-speed", 2, 17e-6, marks=pytest.mark.long), ("ftdi", 0, 105e-6)],
-)
-@in_virtual_time
-async def test_clocks_are_read_at_all_phases_of_a_usb_frame(
-    kind: str, seed: int, bound: float
-) -> None:
-    """In step with frames of 1 ms, readings would show one phase: 290 us rms on each line.
-
-    If replies take 16 ms there is one reading for each heartbeat. By hand: the lowest of five at
-    any phase is late by 170 us, with a standard deviation of 140; at the end of a parabola through
-    16 of them that is 140 * 3 / sqrt(16) = 105.
-    """
-    clocks = await steer(kind, seed, "a", "b", "c")
-    await clocks.skew(6.0)
-
-    assert await clocks.skew(4.0) < bound
-
-
 def record_requests(rig: Rig, patch: pytest.MonkeyPatch) -> list[str]:
     """Return a list to which the names of all requests on the lines of a group are added."""
     names: list[str] = []
@@ -246,25 +225,6 @@ def record_requests(rig: Rig, patch: pytest.MonkeyPatch) -> list[str]:
     for line in rig.group.members.lines:
         patch.setattr(line.wire, "request", partial(record, line.wire.request))
     return names
-
-
-@in_virtual_time
-async def test_poor_clocks_are_read_every_10_ms_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reading costs the host processor time; fast lines vary by 0.1 ms here.
-
-    In 2 s: 40 heartbeats to each of two amplifiers, four readings between two heartbeats, and a
-    status before every fourth heartbeat.
-    """
-    chance = random.Random(1)
-    rig = await connect("a", "b", wire="serial")
-    for line in rig.lines:
-        line.inward = line.outward = lambda _, data: [(chance.expovariate(1e4), data)]
-    names = record_requests(rig, monkeypatch)
-
-    await rig.beat(40)
-
-    assert names.count("Ping") == 2 * 40
-    assert 2 * 10 <= names.count("GetStatus") <= 2 * (4 * 40 + 10)
 
 
 @pytest.mark.parametrize("lines", ["abc", "a b"])
@@ -292,24 +252,6 @@ async def test_sets_play_between_readings_of_clocks(
 
     for name, host in clocks.hosts.items():
         assert host.committed == clocks.group.sets.token, name
-
-
-@pytest.mark.parametrize(("lost", "bound"), [(0.0, 2e-6), (0.02, 10e-6)], ids=["all", "lossy"])
-@in_virtual_time
-async def test_marks_show_the_clocks_of_a_shared_line(lost: float, bound: float) -> None:
-    """Full-speed USB, 2 s after arming: by far better than each reading shows.
-
-    If a Mark or the reply that shows it is lost, the present clock is shown up to 50 ms later and
-    counts for nothing. A lost Ping leaves a clock off by 50 ms of the common rate, mostly 100 ppm:
-    5 us, which are made up within 0.5 s.
-    """
-    clocks = await steer("usb-full-speed", 1, "abc", lost=lost)
-    await clocks.skew(2.0)
-
-    assert await clocks.skew(2.0) < bound
-
-    assert max(clocks.group.clock_errors.values()) < 2 * bound
-    assert clocks.reported() == []
 
 
 @in_virtual_time
@@ -347,19 +289,6 @@ async def test_no_clock_of_a_line_follows_one_that_jumped(plays: bool) -> None:
         await clocks.skew(0.6)
         assert clocks.largest_lead(without=reference) < 125e-6
     assert clocks.reported() == [reference]
-
-
-@in_virtual_time
-async def test_no_clock_of_a_line_follows_one_that_is_not_steered() -> None:
-    """The first ignores its rate and drifts by 40 us per second: it alone is reported."""
-    clocks = await steer("usb-high-speed", 0, "abc")
-    clocks.far["a"].clock.steer = lambda *_: None  # type: ignore[method-assign]
-
-    await clocks.skew(12.0)
-
-    assert abs(clocks.leads()["a"]) > 400e-6
-    assert clocks.largest_lead(without="a") < 125e-6
-    assert clocks.reported() == ["a"]
 
 
 async def crowded_line(baud: int) -> Rig:

@@ -11,9 +11,8 @@ import logging
 import os
 import random
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -21,21 +20,14 @@ import pytest
 import drivers
 from drivers.errors import DriverError, LinkTimeout
 from drivers.playing import AmplifierLayer
-from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet
-from drivers.wires.can_bus import CanWire
-from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import Wire
 from group_stops import LINES as STOPPED_LINES
 from group_stops import PER_CHAIN, PROGRAMMES, Tally
 from group_stops import play as play_stops
-from kit.chain import FINGER, set_running
 from kit.clock import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
 from late_taps import play as play_late_taps
-from registry import threads
-from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from tests.drivers.host.group_on_lines import (
     SILENT,
@@ -120,21 +112,6 @@ async def test_latest_allowed_replies_are_awaited(wire: str, baud: int) -> None:
     await rig.group.beat()
 
     assert rig.retries == 0
-
-
-@pytest.mark.parametrize(
-    ("wire", "baud"), [("rtu", 9600), ("rtu", 57_600), ("serial", 9600), ("serial", 19_200)]
-)
-@in_virtual_time
-async def test_reply_after_a_broadcast_is_awaited_longer(wire: str, baud: int) -> None:
-    """The status that follows the commit of two amplifiers waits for the broadcast as well."""
-    rig, _ = await connect_paced(wire, baud, "a", "b")
-
-    await rig.play(0.5)
-    await rig.play(0.4)
-
-    assert rig.retries == 0
-    assert rig.levels == {"a": [0.4, 0.0], "b": [0.4, 0.0]}
 
 
 @pytest.mark.parametrize("baud", [9600, 57_600])
@@ -377,95 +354,6 @@ async def test_exchanged_lines_are_silenced(wire: str, exchanged: str) -> None:
         assert amplifier.state != "OPERATION_ENABLED", name
 
 
-def slow_serial_time(data: bytes) -> float:
-    """Return the time of bytes of ten bits at 19 200 baud [s]."""
-    return len(data) / 1920
-
-
-def fast_serial_time(data: bytes) -> float:
-    """Return the time of bytes of ten bits at 921 600 baud [s]."""
-    return len(data) / 92_160
-
-
-def rtu_time(data: bytes) -> float:
-    """Return the time of characters of 11 bits and a gap of 3.5 of them at 19 200 baud [s]."""
-    return 11 * (len(data) + 3.5) / 19_200
-
-
-def no_time(_: bytes) -> float:
-    """Return the time of bytes on TCP."""
-    return 0.0
-
-
-def slow_can_time(data: bytes) -> float:
-    """Return the time of frames of at most 111 bits and 24 stuffed ones at 20 kbit/s [s]."""
-    return 135 * len(unpack_frames(data)) / 20_000
-
-
-def timed_line(speed: str, name: str) -> MemoryLine:
-    """Return a line whose bytes take 0.2 ms longer than their bits."""
-    wires: dict[str, tuple[str, Wire, Callable[[bytes], float]]] = {
-        "slow serial": ("serial", SerialWire(19_200, sequence=0), slow_serial_time),
-        "serial": ("serial", SerialWire(921_600, sequence=0), fast_serial_time),
-        "rtu": ("rtu", ModbusWire(19_200, is_rtu=True, number=0), rtu_time),
-        "tcp": ("tcp", ModbusWire(0, is_rtu=False, number=0), no_time),
-        "slow can": ("can", CanWire(20_000, sequence=0), slow_can_time),
-    }
-    kind, wire, duration = wires[speed]
-    line = MemoryLine(kind, name, wire=wire)
-    line.inward = line.outward = lambda _, data: [(duration(data) + 0.0002, data)]
-    return line
-
-
-SPEEDS = ("slow serial", "serial", "rtu", "tcp", "slow can")
-
-
-@pytest.mark.parametrize("speeds", [*combinations(SPEEDS, 2)], ids="-".join)
-@in_virtual_time
-async def test_sets_start_together_on_busy_lines_of_any_speed(speeds: tuple[str, str]) -> None:
-    """Within a step of 305 us just after arming; 3 s later within 1 us, as the amplifiers state.
-
-    The crystals are 40 ppm fast and slow.
-    """
-    lines = [timed_line(speeds[0], "a"), timed_line(speeds[1], "b")]
-    for line, rate in zip(lines, (40e-6, -40e-6), strict=True):
-        (amplifier,) = line.far.values()
-        amplifier.clock = AmplifierClock(Crystal(rate), since=line.loop.time())
-    rig = Rig(lines, await group_of(*lines, watchdog=1.0))
-
-    assert await start_difference(rig) < 305e-6
-    await rig.beat(60)
-    assert await start_difference(rig) < 1e-6
-
-
-async def start_difference(rig: Rig) -> float:
-    """Play while the reply to a status takes 9 ms; return the time between the starts [s].
-
-    No clock is read between a set and its commit, which would wait for the reply.
-    """
-    second = rig.lines[1]
-    outward = second.outward
-
-    def delay_status(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        return [(0.009, data)] if name == "GetStatus" else outward(name, data)
-
-    second.outward = delay_status
-    rig.watch()
-    playing = await begin(rig.play(0.5))
-    await asyncio.sleep(0.0005)
-    await rig.hosts["b"].read_status()
-    await playing
-    second.outward = outward
-    requests = rig.requests()
-    assert "a GetStatus" not in requests[: requests.index("a Commit")]
-
-    await asyncio.sleep(0.02)
-    (voice_a,) = rig.voices("a")
-    (voice_b,) = rig.voices("b")
-    await rig.group.silence(0.0)
-    return abs(voice_a.began - voice_b.began)
-
-
 UNFED = ("modbus", 3, 12)
 """Three amplifiers on a line that were once not fed in time."""
 UNHEARD = ("modbus", 3, 64)
@@ -491,28 +379,6 @@ def test_late_frames_are_no_fault(wire: str, amplifiers: int, seed: int) -> None
     assert counts - Counter(["clicks"] * taps) == Counter()
     assert too_late > 0 or amplifiers == 1
     assert played + too_late >= 0.9 * taps
-
-
-@in_virtual_time
-async def test_stuck_watchdog_is_found_although_replies_are_late() -> None:
-    """On a shared line one commit feeds all amplifiers before each of them in turn."""
-    async with set_running("a", "b", wire="modbus-rtu") as chain:
-
-        def report_a_full_watchdog(name: str, values: Values) -> Values | None:
-            if name != "GetStatus":
-                return None
-            status = chain.far_end.obey(name, values, threads.now())
-            return {**status, "watchdog_left": 250}
-
-        chain.host_rules.disturb()  # a status precedes requests that feed
-        for far_end in chain.far_ends:
-            far_end.delay(0.012)
-        await chain.hold(1.0, down=[FINGER])
-        assert chain.controller.group.is_armed
-
-        chain.far_end.lie(report_a_full_watchdog)
-        await chain.hold(3.0, down=[FINGER])
-        assert not chain.controller.group.is_armed
 
 
 STOPS = int(os.environ.get("STOPS", "84"))

@@ -193,15 +193,6 @@ def test_waiting_tone_continues_one_voice_only_with_its_phase_and_frequency() ->
     account.admit(0.06, layer(1, tone(0.1, 200.0)))
 
 
-def test_cross_fade_at_full_level_is_admitted() -> None:
-    """The gains of a raised cosine add up to one, and their squares to less than one."""
-    account = Account(power=1.0)
-    account.play(0.0, layer(0, tone(1.0)))
-
-    account.admit(1.0, layer(0, tone(1.0, 200.0)))
-    account.admit(1.0, layer(0, tone(1.0, 200.0, channel=1)))
-
-
 def test_ending_during_a_cross_fade_is_refused() -> None:
     """An ending at full level starts 1 ms after the commit: with the old tone, nearly 2."""
     account = Account()
@@ -276,16 +267,6 @@ def test_on_time_limits_validity_and_ramps() -> None:
     assert account.admit(1.9, layer(0, ramp=1.0)).ramp <= 100
 
 
-def test_on_time_ends_with_a_layer_of_level_zero() -> None:
-    """One layer ends by itself at 2 s, the other by tones of level 0 at 1 s."""
-    account = Account(on_time=5.0)
-    account.play(0.0, layer(0, tone(0.3), valid_for=2.0))
-    account.play(0.0, layer(1, tone(0.3, channel=1), valid_for=2.0))
-    account.play(1.0, layer(1, tone(0.0), tone(0.0, channel=1)))
-
-    assert account.admit(6.0, layer(0, tone(), valid_for=1.0)).valid_for == 1000
-
-
 def test_on_time_includes_the_onset_that_a_set_waits_for() -> None:
     """Of 2 s, 0.5 are over, the onset lasts 0.5 more, 0.1 may be on the way and 0.1 is the ramp.
 
@@ -358,19 +339,6 @@ LOUD = layer(2, tone(0.9, 200.0))
 def late_account() -> Account:
     """Return a ledger of an amplifier with eight voices."""
     return Account({**CAPABILITIES, "voices": 8})
-
-
-def test_late_silence_may_leave_a_pulse_playing(late_account: Account) -> None:
-    """By hand: from 85 ms on, a silence along 60 ms leaves the pulse, which is over at 140 ms.
-
-    The silence arrives at 75 to 85 ms.
-    """
-    late_account.play(0.0, layer(0, LATE_PULSE), delay=0.01)
-
-    late_account.ledger.note_ended(0.06, 0.075, 0.085)
-
-    late_account.refuse(0.1, LOUD)
-    late_account.admit(1.075, LOUD)
 
 
 def test_late_fade_may_start_from_a_higher_level(late_account: Account) -> None:

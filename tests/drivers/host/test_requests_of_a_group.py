@@ -5,7 +5,6 @@ its requests, and a faulty one is found.
 """
 
 import asyncio
-import math
 import random
 
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from drivers.errors import CommandRefused, LinkDegraded, LinkTimeout
 from drivers.host.members import outcomes
 from drivers.host.requests import Priority
-from drivers.protocol.definition import FEATURES, STATES
+from drivers.protocol.definition import FEATURES
 from kit.clock import unaltered
 from registry import threads
 from tests.drivers.host.group_on_lines import (
@@ -31,7 +30,6 @@ from tests.drivers.host.group_on_lines import (
     on_wires,
     refuse,
     report,
-    set_unsteered_clock,
 )
 
 
@@ -90,19 +88,6 @@ async def test_only_the_group_feeds_the_watchdog(wire: str) -> None:
     assert rig.levels == {"a": SILENT}
     with pytest.raises(CommandRefused):
         await rig.group.beat()
-
-
-@on_wires()
-async def test_status_is_read_before_some_heartbeats(wire: str) -> None:
-    """Before one of four at most: the reply to a heartbeat itself shows a full watchdog."""
-    rig = await connect("a", wire=wire)
-    rig.watch()
-
-    await rig.beat(20)
-
-    requests = rig.requests()
-    assert requests.count("a Ping") == 20
-    assert 2 <= requests.count("a GetStatus") <= 5
 
 
 @on_wires("serial")
@@ -417,33 +402,6 @@ async def test_measured_levels_may_differ_by_their_error(wire: str) -> None:
         assert host.contradictions.count == count, level
 
 
-@on_wires()
-async def test_copies_of_old_statuses_are_no_replies(wire: str) -> None:
-    """All replies from before arming arrive once more, amid readings and heartbeats."""
-    rig = await connect("a", wire=wire, is_armed=False)
-    host = rig.hosts["a"]
-    copies: list[bytes] = []
-
-    def copy(_: str, data: bytes) -> list[tuple[float, bytes]]:
-        copies.append(data)
-        return [(0.0, data)]
-
-    rig.line.outward = copy
-    await host.read_status()
-    rig.line.outward = unaltered
-    await rig.group.arm()
-    rig.line.outward = late(0.004)
-
-    for request in (host.read_status, rig.group.beat) * 2:
-        running = await begin(request())
-        await asyncio.sleep(0.001)
-        for data in copies:
-            rig.line.line.received(data)
-        await running
-        assert host.status["state"] == STATES["OPERATION_ENABLED"]
-    assert rig.group.is_armed
-
-
 @on_wires("serial")
 async def test_half_of_an_exchange_is_a_clock_error_when_products_differ(wire: str) -> None:
     """The way out may take all or none of 0.4 ms, less the time of the bits.
@@ -461,76 +419,6 @@ async def test_half_of_an_exchange_is_a_clock_error_when_products_differ(wire: s
     assert min(rig.group.clock_errors.values()) >= uncertainty
     single = await connect("c", wire=wire)
     assert single.group.clock_errors == {"c": 0.0}
-
-
-@on_wires("serial")
-async def test_clock_without_a_stated_error_spoils_no_other_clock(wire: str) -> None:
-    """One clock is 10 ms behind and not steered; the two others are held by Marks within 20 us."""
-    rig = await connect("abc", wire=wire, is_armed=False)
-    set_unsteered_clock(rig, "a", -0.01)
-    await rig.group.open()
-    await rig.group.arm()
-
-    await rig.beat(220)
-
-    errors = rig.group.clock_errors
-    assert errors["a"] == math.inf
-    assert errors["b"] < 20e-6
-    assert errors["c"] < 20e-6
-
-
-@on_wires("serial")
-async def test_status_that_shows_an_older_mark_accuses_no_clock(wire: str) -> None:
-    """The request that would show a Mark is lost, and so is the next Mark."""
-    rig = await connect("ab", wire=wire)
-    await rig.beat(40)  # until Marks are read
-    beating = await begin(rig.beat(10))
-    await rig.wait_until_sent("all Mark")
-    to_lose = ["a Ping", "all Mark"]
-
-    def lose_in_turn(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        if to_lose and rig.requests()[-1] == to_lose[0]:
-            del to_lose[0]
-            return []
-        return unaltered(name, data)
-
-    rig.line.inward = lose_in_turn
-    await beating
-
-    assert to_lose == []
-    assert rig.hosts["a"].reported_at == {}
-    assert max(rig.group.clock_errors.values()) < 1e-4
-
-
-@on_wires("serial")
-async def test_marks_that_come_twice_accuse_no_clock(wire: str) -> None:
-    """Every third Mark arrives again up to 60 ms later, while sets play."""
-    rig = await connect("ab", wire=wire)
-    chance = random.Random(1)
-
-    def double(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        arrivals = unaltered(name, data)
-        if name == "Mark" and chance.random() < 1 / 3:
-            arrivals.append((chance.uniform(0.0, 0.06), data))
-        return arrivals
-
-    rig.line.inward = double
-    for number in range(100):
-        await rig.beat(1)
-        await asyncio.sleep((0.017, 0.031)[number % 2])
-        await rig.play((0.1, 0.3)[number % 2])
-        assert max(rig.group.clock_errors.values()) < 1e-4
-
-    assert rig.hosts["a"].reported_at == {}
-    assert rig.hosts["b"].reported_at == {}
-
-
-@on_wires("serial")
-async def test_lines_have_the_order_of_the_amplifiers(wire: str) -> None:
-    """Not the order of their addresses in memory: equal random seeds send equal bytes."""
-    rig = await connect(*"abcdefgh", wire=wire)
-
-    assert list(rig.group.members.lines) == [line.line for line in rig.lines]
 
 
 @pytest.mark.parametrize("request_count", [1, 2])

@@ -10,7 +10,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from drivers.by_hand.actions import read_electrical
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -228,18 +227,6 @@ async def test_missing_part_of_a_set_is_sent_again_with_later_parts(wire: str) -
     assert rig.levels["a"] != SILENT
 
 
-@on_wires("can", "serial")
-async def test_last_part_of_a_set_is_repeated_without_a_reply(wire: str) -> None:
-    """Two replies are lost: the last of four parts is sent three times, the others once."""
-    rig = await connect("a", wire=wire)
-    rig.line.outward = losing("Set", count=2)
-    rig.watch()
-
-    await apply_parts(rig, 4)
-
-    assert rig.requests() == ["a Set"] * 6
-
-
 @on_wires("serial")
 async def test_reply_to_an_earlier_part_does_not_confirm_a_set(wire: str) -> None:
     """An amplifier replies to each of eight parts that the set plays: all are sent."""
@@ -286,20 +273,6 @@ async def test_part_that_never_arrives_is_given_up(wire: str) -> None:
             await apply_parts(rig, 3)
 
     assert rig.group.members.degraded == ("a",)
-
-
-@on_wires("can", "serial", "tcp")
-async def test_reading_that_gives_way_to_a_set_is_no_lost_reply(wire: str) -> None:
-    """Its reply takes 8 ms and the set has several parts: all are played before it is read."""
-    rig = await connect("a", wire=wire)
-    rig.line.outward = late(0.0002, GetMeasured=0.008)
-    reading = await begin(read_electrical(rig.hosts["a"]))
-    await asyncio.sleep(0.001)
-
-    await apply_parts(rig, 4)
-
-    assert rig.group.members.degraded == ()
-    await reading
 
 
 @on_wires("can", "rtu", "serial")
@@ -490,44 +463,6 @@ async def test_sets_start_together_by_clocks_that_cannot_be_steered(
     if len(rig.lines) == 2:
         stated = pytest.approx(played.starts_at, abs=tolerance)
         assert start_times(rig) == {"a": stated, "b": stated}
-
-
-@on_wires("serial")
-async def test_set_starts_immediately_if_a_clock_cannot_be_steered(wire: str) -> None:
-    """A clock 0.4 s behind would wait 0.1 s for a moment that the host's clock has passed."""
-    rig = await connect("a", "b", wire=wire, is_armed=False)
-    set_unsteered_clock(rig, "a", -0.4)
-    await rig.group.open()
-    await rig.group.arm()
-
-    await rig.play(0.5)
-
-    await asyncio.sleep(0.01)
-    assert rig.levels == {"a": HALF, "b": HALF}
-
-
-@on_wires("serial")
-async def test_set_may_start_as_late_as_its_clock_is_behind(wire: str) -> None:
-    """Requests take 6.2 ms until arming, so the clock is behind by as much.
-
-    A status 3 ms after the stated moment still shows the earlier set, which is no fault.
-    """
-    rig = await connect("a", "b", wire=wire, is_armed=False)
-    rig.line.inward = late(0.0062)
-    for _ in range(10):
-        await asyncio.sleep(0.05)
-        await rig.group.statuses()
-    rig.line.inward = late(0.0062, Arm=0.0002)
-    await rig.group.arm()
-    rig.line.inward = unaltered
-
-    for level, earlier_level in ((0.3, 0), (0.6, 3000)):
-        played = await rig.apply(layer(0, tone(level)))
-        await asyncio.sleep(played.starts_at + 0.003 - threads.now())
-        status = await rig.hosts["a"].read_status()
-        assert status["levels"][0] == earlier_level
-        await asyncio.sleep(0.01)
-    assert rig.group.is_armed
 
 
 async def do_nothing(_: Rig) -> None:

@@ -248,13 +248,6 @@ async def test_bus_port_is_not_lost_when_the_queue_of_any_interface_is_full(
     assert await losses_after(case.split()[0], FULL_QUEUE[case], monkeypatch) == []
 
 
-async def test_bus_port_is_lost_after_the_same_code_of_another_interface(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Code 11 is a full queue of Vector, and an error of other interfaces."""
-    assert len(await losses_after("gs_usb", FULL_QUEUE["vector"], monkeypatch)) == 1
-
-
 # Losses
 
 
@@ -269,14 +262,6 @@ async def test_bus_port_is_lost_once_after_a_bus_off_error_frame() -> None:
 
         (loss,) = bus.losses
         assert "bus-off" in loss
-
-
-async def test_bus_port_ignores_error_frames_of_other_interfaces_than_linux() -> None:
-    """They have their own identifiers."""
-    async with open_bus(Interface(is_watched=True)) as bus:
-        bus.receive_error(0x40)
-
-        assert bus.losses == []
 
 
 async def test_bus_port_is_lost_when_sending_fails() -> None:

@@ -9,7 +9,6 @@ from unittest.mock import AsyncMock, Mock
 import pytest
 
 from drivers.errors import LinkError
-from drivers.opening import Lines
 from drivers.ports import PORT_OPENER
 from drivers.wires import can_text
 from drivers.wires.can_frames import (
@@ -24,7 +23,6 @@ from drivers.wires.can_frames import (
 from drivers.wires.can_text import SlcanAddress, TextPort
 from drivers.wires.wire import address_of
 from kit.clock import in_virtual_time
-from registry.limits import GuardLimits
 
 FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 SLCAN_LINE = b"t18580102030405060708\r"
@@ -80,13 +78,6 @@ def test_text_reader_skips_text_that_is_no_frame(text_format: TextFormat, text: 
 
     assert list(reader.feed(text)) == []
     assert list(reader.feed(RECEIVED[text_format])) == [FRAME]
-
-
-def test_text_reader_skips_the_timestamp_of_slcan() -> None:
-    """Four digits after the data, from adapters that are configured to send them."""
-    reader = TextReader(SLCAN)
-
-    assert list(reader.feed(SLCAN_LINE[:-1] + b"ABCD\r")) == [FRAME]
 
 
 # socketcand
@@ -167,22 +158,6 @@ async def test_socketcand_server_that_does_not_open_the_bus_is_reported_with_a_r
             await frames_from(url)
 
 
-async def test_socketcand_connection_ends_when_its_opening_is_cancelled() -> None:
-    """The server has accepted the connection and does not reply."""
-    lines = Lines()
-    limits = GuardLimits(20.0, 1000.0, 1.0)
-    accepted = asyncio.Event()
-    async with server(b" ", accepted=accepted) as url:  # ends with its connection
-        opening = asyncio.ensure_future(lines.amplifier(url, limits, name="a"))
-        await accepted.wait()
-
-        opening.cancel()
-
-        with pytest.raises(asyncio.CancelledError):
-            await opening
-    await lines.close()
-
-
 # slcan
 
 
@@ -259,12 +234,3 @@ async def test_slcan_text_that_is_no_reply_of_an_adapter_is_an_error() -> None:
     port.received(b"AT\r\nERROR\r\n")
 
     assert frames == [FRAME, CanFrame(0x800, b"AT"), CanFrame(0x800, b"ERROR")]
-
-
-async def test_slcan_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
-    """A port that could not send everything drops the rest of a line; a CR ends that line."""
-    adapter = AdapterText(is_blocked=True, cut_off=b"\r")
-
-    adapter.port.write(pack_frames([FRAME]))
-
-    assert adapter.sent == b"\r" + SLCAN_LINE

@@ -14,10 +14,7 @@ from scipy.stats import poisson
 from drivers.protocol.definition import IDENTITY, MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
-from drivers.wires.can_bus import CanWire
-from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.modbus import ModbusWire
-from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Arrival, BrokenReply, Continuation, Nak, Reply, Wire
 from kit.clock import KINDS
 from kit.wires import damage
@@ -33,43 +30,6 @@ PART: Values = {
 }
 """A Set that is played immediately: layer 3 is renewed for 800 ms."""
 REPLY: Values = {"token": 0x0102, "exact": 1, "staged": 0, "played": 1, "missing": 0}
-
-
-def test_set_and_its_reply_have_the_bytes_of_the_specification_on_a_serial_line() -> None:
-    """One frame each, encoded with COBS."""
-    wire = SerialWire(921_600, sequence=7)
-    request = "00 05 05 04 01 08 06 17 2A 02 01 03 03 A0 01 01 07 20 03 93 C9 91 CA 00"
-    reply = "00 05 85 04 01 08 04 02 01 05 01 01 05 34 FF 32 E7 00"
-
-    assert wire.request(1, "Set", PART) == bytes.fromhex(request)
-    assert wire.received(bytes.fromhex(reply)) == [Reply(REPLY)]
-
-
-def test_set_and_its_reply_have_the_bytes_of_the_specification_on_can() -> None:
-    """Three frames, and two of the reply."""
-    wire = CanWire(500_000, sequence=7)
-    request = ("0800 0506 172A 0201", "0801 0300 A001 0000", "0802 2003 0000 0000")
-    reply = ("0800 0503 0201 0500", "0801 0000 0000 0000")
-
-    sent = [CanFrame(0x201, bytes.fromhex(data)) for data in request]
-    received = [CanFrame(0x181, bytes.fromhex(data)) for data in reply]
-    assert wire.request(1, "Set", PART) == pack_frames(sent)
-    assert wire.received(pack_frames(received)) == [Reply(REPLY)]
-
-
-def test_set_and_its_reply_have_the_bytes_of_the_specification_over_modbus_tcp() -> None:
-    """The write and the read of the reply are sent together."""
-    wire = ModbusWire(0, is_rtu=False, number=0)
-    request = (
-        "0001 0000 0015 01 10 0500 0007 0E 0001 2A17 0102 0003 01A0 0000 0320"
-        "0002 0000 0006 01 04 0580 0005"
-    )
-    write_response = "0001 0000 0006 01 10 0500 0007"
-    read_response = "0002 0000 000D 01 04 0A 0001 0000 0102 0005 0000"
-
-    assert wire.request(1, "Set", PART) == bytes.fromhex(request)
-    assert wire.received(bytes.fromhex(write_response)) == []
-    assert wire.received(bytes.fromhex(read_response)) == [Reply(REPLY)]
 
 
 def test_set_and_its_reply_have_the_bytes_of_the_specification_over_modbus_rtu() -> None:

@@ -59,21 +59,6 @@ def test_reader_takes_a_frame_only_when_it_is_complete() -> None:
     assert reader.rest == b""
 
 
-@pytest.mark.parametrize("is_host", [True, False])
-@pytest.mark.parametrize("unit", [1, 2])
-def test_reader_finds_a_frame_after_noise(unit: int, is_host: bool) -> None:
-    """A host accepts only the response to its request there."""
-    noise = b"\x01\x03"
-    reader = AduReader(is_rtu=True, of_requests=False, is_host=is_host)
-    request = Write(dev_id=unit, address=0x600, registers=[3, 9, 7])
-
-    frames = reader.feed(noise + RESPONSE, request) + reader.end()
-
-    is_accepted = unit == 1 or not is_host
-    assert [frame.raw for frame in frames if frame.pdu] == [RESPONSE] * is_accepted
-    assert b"".join(frame.raw for frame in frames) == noise + RESPONSE
-
-
 @pytest.mark.parametrize("waits", shortly([True, False], [True]))
 @pytest.mark.parametrize(
     ("noise", "part"), in_turn([b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"], [250, 1 << 16])
@@ -313,18 +298,6 @@ def test_exception_is_a_refusal_unless_it_is_of_a_gateway(
     assert wire.received(bytes([0, 1, 0, 0, 0, 3, 1, 0x90, exception])) == expected
 
 
-def test_hello_reveals_a_device_that_is_no_amplifier() -> None:
-    """Another Modbus device at this address has no such registers."""
-    wire = ModbusWire(0, is_rtu=False, number=0)
-    for code in (1, 2, 3, 4):
-        wire.request(7, "Hello", {})
-
-        (arrival,) = wire.received(bytes.fromhex(f"{code:04X} 0000 0003 07 84 {code:02X}"))
-
-        assert isinstance(arrival, BrokenReply)
-        assert "unit 7 is no amplifier" in arrival.reason
-
-
 @rtu_and_tcp
 def test_reply_to_another_master_belongs_to_no_request(is_rtu: bool) -> None:
     """Another master wrote the same message before the reply was read."""
@@ -423,23 +396,6 @@ def test_exchange_time_on_a_line_is_that_of_its_characters_and_silences() -> Non
     wire = ModbusWire(115_200, is_rtu=True, number=0)
 
     assert wire.exchange_time(22, 3) == pytest.approx(86 * 11 / 115_200 + 4 * 1.75e-3)
-
-
-@pytest.mark.parametrize("rate", [9600, 19_200])
-def test_silence_on_a_slow_line_lasts_three_and_a_half_characters(rate: int) -> None:
-    """Modbus over serial line V1.02, section 2.5.1.1."""
-    assert ModbusWire(rate, is_rtu=True, number=0).silence == pytest.approx(3.5 * 11 / rate)
-
-
-def test_exchange_over_a_network_takes_no_time_on_a_line() -> None:
-    """Neither a set nor a broadcast."""
-    wire = ModbusWire(0, is_rtu=False, number=0)
-
-    wire.request(1, "GetStatus", {})
-    wire.request(0, "Commit", COMMIT)
-
-    assert wire.exchange_time(22, 3) == 0
-    assert wire.takes == 0
 
 
 def test_broadcast_through_a_gateway_includes_the_time_of_every_write() -> None:

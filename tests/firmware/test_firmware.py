@@ -50,7 +50,6 @@ from firmware_records import records_header
 from kit import hand_frames as hand
 from kit.hand_frames import tone as command
 from kit.judged_lines import judged
-from kit.modbus_masters import MASTERS, drive
 from kit.wires import damage
 from model.arrays import FloatArray
 from processes.installed import installed_program
@@ -77,6 +76,7 @@ from tests.firmware.firmware_machine import (
     values_of,
 )
 from tests.firmware.firmware_machine import LINES as FIRMWARE_KINDS
+from tests.firmware.modbus_masters import MASTERS, drive
 
 ROOT = Path(__file__).parents[2]
 WORD = WireQuantity("word", "u16", 1, "", 0, 0xFFFF)
@@ -636,18 +636,6 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     status = values_of(firmware, hand.GET_STATUS)
     assert status["state"] == hand.FAULT
     assert status["fault"] == hand.WATCHDOG
-
-
-def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
-    """Of 250 ms, 0.21 s after it was fed, 40 are left, though samples were made for 0.11 s only."""
-    firmware = MovedFirmware(replaying)
-    firmware.receive(SERIAL, arm(250))
-    firmware.move(0.1)
-    firmware.stall(0.2, is_converter_still=True)
-    firmware.move(0.21)
-    status = values_of(firmware, hand.GET_STATUS)
-    assert status["state"] == hand.ENABLED
-    assert status["watchdog_left"] == pytest.approx(40, abs=1)
 
 
 def test_high_voltage_is_measured_as_soon_as_it_is_switched(replaying: Path) -> None:

@@ -65,16 +65,6 @@ def test_angle_is_the_frequency_word_times_the_clock(two_amplifiers: Rig) -> Non
             assert moved == pytest.approx(math.sin(2 * math.pi * turns), abs=1e-5)
 
 
-def test_tone_goes_on_where_the_clock_goes_round(coarse_rig: Rig) -> None:
-    """A steady tone of 110.05 Hz has no step and no new phase at 20 s and at 40 s."""
-    bench = Bench(coarse_rig, now=18.0)
-    bench.place_fingers({"a": AT}, now=18.0)
-    play_at_once(bench, AmplifierTone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
-    early, over, late = phases(bench, (19.9, 20.4, 40.3), 110.05)
-    assert early == pytest.approx(over, abs=1e-5)
-    assert early == pytest.approx(late, abs=1e-5)
-
-
 def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
     """At +40 and -30 ppm, two amplifiers move apart by 70 us each second, until one is steered."""
     crystals = {"left": Crystal(error=40e-6), "right": Crystal(error=-30e-6)}
@@ -100,21 +90,6 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
     assert steered / (2 * math.pi * 110) == pytest.approx(expected, abs=1e-6)
 
 
-def test_shift_is_of_the_phase(coarse_rig: Rig) -> None:
-    """Arm with 5 steps of 20 s / 65536 lets a tone of 110 Hz lead by 60.4 degrees."""
-    delays = []
-    for shift in (0, 5):
-        bench = Bench(coarse_rig, now=0.0)
-        bench.place_fingers({"a": AT}, now=0.0)
-        values = {"session": BENCH_SESSION, "watchdog": 2000, "shift": shift}
-        bench.exchange("main", "Arm", values, now=0.0)
-        play_at_once(bench, AmplifierTone(0, 110.0, 0.5), now=0.1)
-        delays.append(phases(bench, (3.0,), 110.0)[0, 0])
-    assert math.degrees(delays[1] - delays[0]) == pytest.approx(
-        360 * 110 * 5 * 20 / 65536, abs=1e-3
-    )
-
-
 START = 98765.4321  # as large as a clock may be
 
 
@@ -136,41 +111,6 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     )
     driven = late.felt(START + 0.25, START + 0.35)["a"].peak.max()
     assert late.felt(START + 1.9, START + 2.1)["a"].peak.max() < 0.02 * driven
-
-
-def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None:
-    """A finger's samples are the same if read every 3 ms or once at the end."""
-    records = []
-    for is_read in (True, False):
-        bench = Bench(coarse_rig, now=START)
-        bench.place_fingers({"a": (0.1, 0.1)}, now=START)
-        arm_bench(bench, 2.0, now=START)
-        for step in range(1, 101):
-            now = START + 0.003 * step
-            if step in (20, 45, 70):  # at 20 abruptly
-                tone = AmplifierTone(step % 4, 100.0 + step, 1.0)
-                play_at_once(bench, tone, now=now, token=step, ramp=0.001 * (step - 20))
-            bench.advance(now)
-            if is_read:
-                bench.records(START, now)
-        records.append(bench.records(START, bench.time)[0]["a"])
-    read, unread = records
-    np.testing.assert_array_equal(unread.times, read.times)
-    np.testing.assert_allclose(np.diff(read.times), 1e-4, rtol=1e-4)
-    peak = np.abs(read.accelerations).max()
-    np.testing.assert_allclose(unread.accelerations, read.accelerations, atol=1e-6 * peak)
-
-
-def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
-    """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
-    bench = Bench(coarse_rig, now=0.0)
-    bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
-    arm_bench(bench, 0.25, now=0.0)
-    play_at_once(bench, AmplifierTone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
-    bench.advance(86_400.0)
-    felt = bench.felt(86_400.0 - 9.9, 86_400.0)
-    assert felt["a"].peak.max() < 1e-9
-    assert bench.sample_fingers().felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
 
 
 A, B = (0.1, 0.07), (0.29, 0.2)

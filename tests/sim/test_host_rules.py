@@ -60,14 +60,6 @@ def test_rules_are_kept_in_random_days(kind: str, lines: str, seed: int) -> None
     live(kind, lines, seed)
 
 
-@pytest.mark.parametrize("seed", shortly(range(8), [1]))
-@pytest.mark.parametrize("lines", shortly(LINES, ["shared"]))
-@pytest.mark.parametrize("kind", shortly(KINDS, ["serial", "tcp"]))
-def test_rules_are_kept_after_lost_and_doubled_frames(kind: str, lines: str, seed: int) -> None:
-    """Host and amplifiers recover, and half a second later all rules hold again."""
-    live(kind, lines, seed, lossy_steps=25)
-
-
 ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}
 """The excitation for one finger."""
 SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}

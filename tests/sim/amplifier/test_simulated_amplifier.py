@@ -8,7 +8,6 @@ adapters are compared with the interfaces of python-can.
 
 import asyncio
 import contextlib
-import math
 import os
 import re
 import socket
@@ -23,13 +22,12 @@ import can
 import pytest
 
 from drivers.errors import LinkError
-from drivers.protocol.definition import FAULTS, REFUSALS, STATES
+from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
-from kit.modbus_masters import MASTERS, drive
-from kit.wires import far_side, make_bench, until
+from kit.wires import make_bench, until
 from model.rig.rig import Rig
 from sim.amplifier.amplifier_clock import AmplifierClock, Crystal
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
@@ -37,24 +35,11 @@ from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.far_ends.simulated_bus import CanBus, SlcanAdapter, SocketcandClient
-from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import Faults
 from sim.transport.far_end import FarEnd
 from sim.transport.serving import TcpEnd, TerminalEnd
 
 PER_SECOND = 214_748_364.8
-
-
-def test_clock_goes_round_in_20_s() -> None:
-    """A clock without errors shows a quarter of its span after 5 s, and again after 25.
-
-    So the high word 0x4000 comes at 5 s, or after the end of a turn at 25 s.
-    """
-    clock = AmplifierClock()
-    assert [clock.reading(time) for time in (0.0, 5.0, 20.0, 25.0)] == [0, 1 << 30, 0, 1 << 30]
-    assert clock.seconds(25.0) == 25.0
-    moments = [clock.reaches(0x4000, time) for time in (0.0, 6.0, 5.0)]
-    assert moments == pytest.approx([5.0, 25.0, 5.0], abs=1e-11)
 
 
 def test_crystal_and_rate_multiply() -> None:
@@ -74,16 +59,6 @@ def test_shift_moves_the_high_word_on() -> None:
     assert clock.reading(0.0) == 0x0003_0000
     clock.shift(65_534)
     assert clock.reading(0.0) == 0x0001_0000
-
-
-def test_clock_starts_again_with_its_supply() -> None:
-    """After a restart the clock shows 0 and runs as fast as its crystal, which stays warm."""
-    clock = AmplifierClock(Crystal(error=20e-6, warm_up=1e-6, ahead=7.0))
-    assert clock.reading(0.0) == round(7 * PER_SECOND)
-    clock.steer(1000, 1.0)
-    clock.restart(500.0)
-    assert clock.reading(500.0) == clock.rate == 0
-    assert clock.seconds(501.0) == pytest.approx(1 + 30e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("rate", [0, 500, -32768])
@@ -152,11 +127,6 @@ def state_name(values: Values) -> str:
     return next(name for name, code in STATES.items() if code == values["state"])
 
 
-def lead(status: Values, time: float) -> int:
-    """Return the lead of a clock over one without errors [2^-32 of 20 s]."""
-    return int(status["clock"]) - round(time * PER_SECOND)
-
-
 def test_heat_derates_and_then_trips() -> None:
     """Above 70 degrees C half of every level, reported as inexact; above 85 a fault until cool."""
     requests = Requests()
@@ -186,22 +156,6 @@ def test_open_interlock_trips_and_prevents_arming() -> None:
     assert requests.arm(0.3, session=8) == "OPERATION_ENABLED"
 
 
-def test_restart_forgets_all_but_the_faults() -> None:
-    """Silent and disarmed, without token and latch; an arc on channel 1 was 0.2 s ago."""
-    requests = Requests()
-    requests.play(0.0, 9, (0, 5000))
-    requests.amplifier.trip(fault="ARC", moment=0.1, channel=1)
-
-    requests.amplifier.restart(0.2)
-
-    status = requests.status(0.2)
-    assert state_name(status) == "SWITCH_ON_DISABLED"
-    assert (status["token"], status["latch"]) == (0, 0)
-    assert status["levels"] == [0, 0]
-    faults = requests.ask(0.3, "GetFaults")["faults"]
-    assert faults == [{"fault": FAULTS["ARC"], "channel": 1, "age": 200}]
-
-
 def test_high_voltage_is_on_while_armed_and_then_discharges() -> None:
     """1800 V: 1273 V rms at full level, and 2 pi f/2 C U = 400 uA in a capacitor of 1 nF.
 
@@ -216,73 +170,6 @@ def test_high_voltage_is_on_while_armed_and_then_discharges() -> None:
     requests.ask(0.1, "Disarm", ramp=0)
     assert requests.status(0.12)["high_voltage"] == 662
     assert Requests(is_armed=False).ask(0.0, "Stop", ramp=5)["high_voltage"] == 0
-
-
-def test_ping_sets_the_rate_of_an_armed_session() -> None:
-    """100 ppm for a second are 21 475 steps of the clock; a disarmed amplifier has no rate."""
-    requests = Requests(is_armed=False)
-    requests.ping(0.0, rate=1000)
-    requests.arm(1.0, watchdog=2000)
-
-    assert lead(requests.ping(1.0, rate=1000), 1.0) == pytest.approx(0, abs=1)
-    assert lead(requests.ping(2.0, rate=1000), 2.0) == pytest.approx(21475, abs=1)
-    requests.ask(2.0, "Disarm", ramp=0)
-    assert lead(requests.status(4.0), 4.0) == pytest.approx(21475, abs=1)
-
-
-def test_expired_watchdog_ends_the_rate() -> None:
-    """It counts real time: 3276.7 ppm for 0.25 s are 175 916.5 steps."""
-    requests = Requests()
-    requests.ping(0.0, rate=32767)
-
-    requests.amplifier.tick(1.0)
-
-    assert requests.event_times[0] == pytest.approx(0.25)
-    assert lead(requests.status(1.0), 1.0) == pytest.approx(175916.5, abs=1)
-
-
-def test_arm_shifts_the_clock_of_a_new_session_once() -> None:
-    """By 3 steps of the high word, 65536 each; a restarted clock shows 0."""
-    requests = Requests(is_armed=False)
-    requests.arm(0.0, shift=3)
-    requests.arm(0.1, shift=3)
-    assert lead(requests.status(0.1), 0.1) == 3 * 65536
-
-    requests.amplifier.restart(5.0)
-
-    assert requests.status(5.0)["clock"] == 0
-
-
-def test_temperature_follows_the_mean_square_level() -> None:
-    """Half level on both channels: a quarter of 30 K, 1 - 1/e of it after 120 s."""
-    requests = Requests(is_armed=False)
-    requests.arm(0.0, watchdog=2000)
-    requests.play(0.0, 1, (0, 5000), (1, 5000))
-    for second in range(1, 121):
-        status = requests.ping(float(second))
-    assert status["temperature"] == pytest.approx(250 + 75 * (1 - 1 / math.e), abs=1)
-
-
-@pytest.mark.parametrize(
-    ("moment", "level"), [(99, 5000), (100, 5000), (101, 0), (1738, 0), (1739, 5000)]
-)
-def test_commit_for_no_moment_ahead_starts_immediately(moment: int, level: int) -> None:
-    """The present high word, 100, one that has passed, or one more than 1638 steps ahead."""
-    requests = Requests()
-    now = 100.5 * 20 / 65536
-    requests.play(now, 1, (0, 5000), now=False)
-
-    requests.ask(now, "Commit", session=SESSION, token=1, at=moment)
-
-    assert requests.status(now)["levels"] == [level, 0]
-
-
-@pytest.mark.parametrize("name", MASTERS)
-async def test_foreign_master_drives_it(name: str, coarse_rig: Rig) -> None:
-    """Reads by both functions, writes, a set, and an exception, over a real line."""
-    line, make = MASTERS[name]
-    async with far_side(SimulatedWire(f"modbus-{line}"), coarse_rig) as far:
-        assert await asyncio.to_thread(drive, make, far.url) == "era-haptics"
 
 
 TIMEOUT = 60.0  # s; of a busy machine
@@ -315,17 +202,6 @@ async def ask(connection: Client, request: bytes, size: int) -> bytes:
     reader, writer = connection
     writer.write(request)
     return await asyncio.wait_for(reader.readexactly(size), TIMEOUT)
-
-
-async def test_connections_share_the_registers_of_a_unit(coarse_rig: Rig) -> None:
-    """One client writes tag 7 to Stop, and the other reads it; another unit does not reply."""
-    async with tcp_end(coarse_rig) as end, client(end) as writing, client(end) as reading:
-        write = struct.pack(">HHHBBHHBHH", 2, 0, 11, 1, 16, 256 * 8, 2, 4, 7, 0)
-        assert (await ask(writing, write, 12))[6:] == write[6:12]
-        look = struct.pack(">HHHBBHH", 3, 0, 6, 1, 3, 256 * 8 + 128, 3)
-        elsewhere = struct.pack(">HHHBBHH", 4, 0, 6, 9, 3, 256 * 8 + 128, 3)
-        reply = await ask(reading, elsewhere + look, 15)
-        assert struct.unpack(">HHHBBBHHH", reply) == (3, 0, 9, 1, 3, 6, 7, 0, 5)
 
 
 async def test_client_that_does_not_read_is_disconnected(coarse_rig: Rig) -> None:
@@ -403,36 +279,6 @@ def on_a_line() -> Callable[..., list[Frame]]:
         return replies
 
     return ask
-
-
-@pytest.mark.parametrize(
-    ("kind", "payload", "version", "code"),
-    [
-        (99, "00", 2, "UNSUPPORTED_VERSION"),  # also unknown, with half a word
-        (99, "0000", 4, "UNKNOWN_TYPE"),
-        (3, "0000", 4, "BAD_VALUE"),  # session 0, and a word is missing
-        (3, "0100 FA00", 4, "BAD_LENGTH"),
-        (3, "0100 FA00 0000 0000", 4, "BAD_LENGTH"),
-        (6, "0100 0000 0000", 4, "BAD_TOKEN"),  # in the wrong state as well
-        (6, "0100 0100 0000", 4, "WRONG_STATE"),  # of another session as well
-    ],
-)
-def test_first_fault_wins_while_disarmed(kind: int, payload: str, version: int, code: str) -> None:
-    """The order is version, type, words, state."""
-    (reply,) = on_a_line()(kind, payload, version)
-    assert (reply.kind, reply.payload[2]) == (0x9F, REFUSALS[code])
-
-
-def test_wrong_session_is_reported_before_wrong_values() -> None:
-    """Session 7 is armed: a truncated set of session 8, and an Arm of another host."""
-    ask = on_a_line()
-    ask(3, "0700 FA00 0000")
-    for kind, payload, code in (
-        (5, "0800 0100 0200 0100", "WRONG_SESSION"),
-        (5, "0700 0100 0200 0100", "BAD_LENGTH"),
-        (3, "0800 D007 0000", "WRONG_SESSION"),
-    ):
-        assert ask(kind, payload)[-1].payload[2] == REFUSALS[code]
 
 
 def test_echo_of_an_event_gets_no_reply() -> None:
@@ -516,31 +362,6 @@ def test_socketcand_session() -> None:
     assert re.fullmatch(rb"< frame 181 [\d.]+ 0102030405060708 >", written[-1])
     _, refused, _ = on_bus(SocketcandClient, "< open vcan7 >")
     assert refused == [b"< hi >", b"< error could not open bus >", b""]  # which ends it
-
-
-@pytest.mark.parametrize(
-    "nonsense",
-    [
-        "< send 123 3 1 2 >",
-        "< send 800 0 >",
-        "< send 00000123 0 >",
-        "< send x 1 1 >",
-        "< send 123 9 1 2 3 4 5 6 7 8 9 >",
-        "<>",
-        ">",
-        "a" * 2000,
-        "< send 123 1 100 >",
-        "\x00\xff< send",
-    ],
-)
-def test_socketcand_ignores_malformed_frames(nonsense: str) -> None:
-    """A malformed element sends no frame, and the next one is understood."""
-    opened = "< open can0 >< rawmode >"
-    _, written, heard = on_bus(
-        SocketcandClient, f"{opened}{nonsense} >", "< send 123 1 5 >< echo >"
-    )
-    assert written[-1] == b"< echo >"
-    assert heard == [CanFrame(0x123, b"\x05")]
 
 
 async def test_slcan_serves_python_can(coarse_rig: Rig) -> None:

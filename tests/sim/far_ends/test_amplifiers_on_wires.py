@@ -13,19 +13,15 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from cases import shortly
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
-from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
-from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
-    FAULTS,
     HEARTBEAT,
     MESSAGES,
     STATES,
@@ -34,18 +30,15 @@ from drivers.protocol.definition import (
 )
 from drivers.urls import ADDRESS
 from drivers.wires.serial_frames import Frame, encode_frame
-from drivers.wires.serial_line import SerialWire
-from kit.clock import VirtualLoop, in_virtual_time
-from kit.plates import TWO_AMPLIFIERS, make_paper_rig, write_rig
+from kit.clock import in_virtual_time
+from kit.plates import TWO_AMPLIFIERS, write_rig
 from kit.wires import (
     LIMITS,
-    SHARED_WIRES,
     WIRES,
     HostedRig,
     after_each,
     far_side,
     layer,
-    make_bench,
     on_two_amplifiers,
     rig_on_wire,
 )
@@ -53,10 +46,8 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from registry import threads
 from registry.threads import no_long_collections
-from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
 from sim.faults import FaultKind, Faults, FaultWindow, load_faults
-from sim.memory_line import MemoryPort
 from sim.simulation import STEP, SteppedLoop
 from sim.transport.simulated_line import SimulatedLine as MemoryLine
 
@@ -165,90 +156,6 @@ def wire(request: pytest.FixtureRequest) -> SimulatedWire:
     return replace(wire, speed=SPEEDS.get(wire.kind))
 
 
-@in_virtual_time
-async def test_broadcast_commit_starts_all_at_one_moment(
-    coarse_rig: Rig, wire: SimulatedWire, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By their own clocks, however long the simulation of each takes; not over TCP.
-
-    And however much either has sent before.
-    """
-    rig_of_two = on_two_amplifiers(coarse_rig)
-    async with rig_on_wire(rig_of_two, replace(wire, shared=True)) as rig:
-        loop, exchange = asyncio.get_running_loop(), rig.bench.exchange
-        assert isinstance(loop, VirtualLoop)
-
-        def exchange_slowly(name: str, *request: Any, now: float) -> Any:
-            loop.now += 0.002
-            return exchange(name, *request, now=now)
-
-        monkeypatch.setattr(rig.bench, "exchange", exchange_slowly)
-        await rig.group.arm()
-        for number in range(1, 4):
-            for _ in range(number):
-                await rig.group.amplifiers["east"].read_status()
-            played = [layer((0, 100.0 + number, 0.1 * number))]
-            await rig.group.apply({"east": played, "west": played})
-            origins = [
-                amplifier.outputs[0][-1].began for amplifier in rig.bench.amplifiers.values()
-            ]
-            assert abs(origins[0] - origins[1]) <= (0.005 if wire.kind == "modbus-tcp" else 0.0)
-        await rig.group.disarm()
-
-
-async def play_on_all(rig: HostedRig, level: float) -> None:
-    """Play 110 Hz at a level on the first channel of every amplifier."""
-    played = [layer((0, 110.0, level))]
-    await rig.group.apply(dict.fromkeys(rig.group.amplifiers, played))
-
-
-ALLOWED_STATES = {STATES["FAULT"], STATES["QUICK_STOP_ACTIVE"]}
-SILENCING_FAULTS = {
-    "over_voltage": "OVER_VOLTAGE",
-    "arc": "ARC",
-    "over_current": "OVER_CURRENT",
-    "channel": "CHANNEL",
-    "over_temperature": "OVER_TEMPERATURE",
-    "interlock": "INTERLOCK",
-    "hang": "WATCHDOG",
-    "nak_storm": "WATCHDOG",
-    "unplug": "WATCHDOG",
-    "reboot": "NONE",
-}
-"""The fault that a status shows after a simulated fault."""
-
-
-@pytest.mark.parametrize("kind", SILENCING_FAULTS)
-@in_virtual_time
-async def test_fault_silences_an_amplifier_until_it_is_cleared(
-    coarse_rig: Rig, wire: SimulatedWire, kind: FaultKind
-) -> None:
-    """The fault lasts a second; the host stops, finds the amplifier again, and plays."""
-    async with rig_on_wire(coarse_rig, wire) as rig:
-        await rig.group.arm()
-        await play_on_all(rig, 1.0)
-        await rig.beat_until(threads.now() + 0.2)
-        assert rig.levels("main")[0] == 1.0
-
-        fault(rig, kind, lasts=1.0)
-        with pytest.raises(DriverError):
-            await rig.beat_until(threads.now() + 2.0)
-        assert not rig.group.is_armed
-        await asyncio.sleep(0.3)
-        assert set(rig.levels("main")) == {0.0}
-        await asyncio.sleep(1.0)
-        await rig.reopen(within=5.0)
-
-        status = rig.group.amplifiers["main"].status
-        assert status["fault"] == FAULTS[SILENCING_FAULTS[kind]]
-        restarted = {STATES["SWITCH_ON_DISABLED"]} if kind == "reboot" else set()
-        assert status["state"] in ALLOWED_STATES | restarted
-        await rig.group.clear()
-        await rig.group.arm()
-        await play_on_all(rig, 0.5)
-        await rig.group.disarm()
-
-
 @pytest.mark.parametrize("wire", ["can+slcan", "can+socketcand"], indirect=True)
 @in_virtual_time
 async def test_can_node_does_not_reply_after_a_restart_until_it_is_identified(
@@ -266,88 +173,6 @@ async def test_can_node_does_not_reply_after_a_restart_until_it_is_identified(
         await main.identify()
         await main.read_status()
         assert main.status["state"] == STATES["SWITCH_ON_DISABLED"]
-
-
-@pytest.mark.parametrize("shared_wire", SHARED_WIRES)
-@in_virtual_time
-async def test_stop_silences_the_other_amplifier_of_a_line_while_one_hangs(
-    coarse_rig: Rig, shared_wire: str
-) -> None:
-    """West is silent within 50 ms of the stop, and east after its watchdog."""
-    shared = SHARED_WIRES[shared_wire]
-    shared = replace(shared, speed=SPEEDS.get(shared.kind))
-    async with rig_on_wire(on_two_amplifiers(coarse_rig), shared) as rig:
-        await rig.group.arm()
-        await play_on_all(rig, 0.5)
-        rig.devices["east"].inject_fault(FaultWindow(fault="hang"))
-
-        began = threads.now()
-        stopping = asyncio.create_task(rig.group.stop())
-        await asyncio.sleep(0.05)
-        assert set(rig.levels("west")) == {0.0}
-        assert rig.levels("east")[0] == 0.5
-        outcomes = await stopping
-
-        assert outcomes["west"].is_confirmed
-        assert not outcomes["east"].is_confirmed
-        assert outcomes["east"].may_play_until > began
-        await asyncio.sleep(0.3)
-        assert set(rig.levels("east")) == {0.0}
-
-
-@pytest.mark.parametrize(
-    ("kind", "shortest", "longest"),
-    [("serial", 0.0479, 0.1158), ("modbus+rtu", 0.0527, 0.1254)],
-)
-@in_virtual_time
-async def test_status_takes_the_time_of_its_bytes_on_a_slow_line(
-    kind: str, shortest: float, longest: float
-) -> None:
-    """At 9600 baud, from an amplifier of four channels.
-
-    Request and reply have 23 words, of bytes of 10 or 11 bits, and 8 to 9 further bytes each.
-    """
-    slow = replace(WIRES[kind], speed=9600)
-    async with rig_on_wire(make_paper_rig(12, 9), slow, watchdog=2.0) as rig:
-        began = threads.now()
-        await rig.group.amplifiers["main"].read_status()
-
-        assert shortest <= threads.now() - began <= longest
-
-
-def line_to(device: AmplifierDevice) -> Line:
-    """The host's line to a device of this process."""
-    line = Line(SerialWire(0, sequence=0), "main")
-    line.open(MemoryPort([device], line.received, line.lose))
-    return line
-
-
-@in_virtual_time
-async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig: Rig) -> None:
-    """Requests fail immediately, the watchdog silences, and the line opens once plugged in."""
-    bench, devices = make_bench(coarse_rig)
-    device = devices["main"]
-    group = await opened_group(line_to(device))
-    await group.arm()
-    await group.apply({"main": [layer((0, 110.0, 1.0))]})
-    device.inject_fault(FaultWindow(fault="unplug", lasts=1.0))
-    with pytest.raises(LinkError, match="unplugged"):
-        await group.beat()
-    with pytest.raises(LinkError, match="unplugged"):
-        line_to(device)
-    await asyncio.sleep(1.01)
-    bench.advance(threads.now())
-    summary = bench.amplifiers["main"].summary(bench.time)
-    assert set(summary.levels) == {0.0}
-    again = await opened_group(line_to(device))
-    assert (await again.amplifiers["main"].read_status())["fault"] == FAULTS["WATCHDOG"]
-
-
-async def opened_group(line: Line) -> Group:
-    """The group of the only amplifier of a line, open."""
-    group = Group({"main": Amplifier(line, 1, LIMITS, name="main")})
-    await group.open()
-    return group
 
 
 ROUND_TRIPS = {"&line=prompt": (0.0, 0.0), "": (28e-6, 1e-3), "&line=ftdi": (10e-3, 12e-3)}
@@ -484,17 +309,6 @@ def test_fault_changes_frames_while_active(kind: str, is_so: "object") -> None:
         assert faults.pass_on(FRAME, toward="amplifier", time=time) == [(0.0, FRAME)]
 
 
-@pytest.mark.parametrize("finds_damage", [False, True])
-@pytest.mark.parametrize("kind", ["drop", "delay", "duplicate", "corrupt", "truncate", "hang"])
-def test_end_of_a_connection_passes_when_a_fault_is_active(
-    kind: FaultKind, finds_damage: bool
-) -> None:
-    """The end of a connection is an empty frame, which no fault changes."""
-    faults = Faults([FaultWindow(fault=kind)])
-    passed = faults.pass_on(b"", toward="host", time=1.0, finds_damage=finds_damage)
-    assert passed == [(0.0, b"")]
-
-
 def test_fault_hits_a_share_of_one_direction() -> None:
     """A fifth of the frames to the host; the same seed hits the same ones."""
     first, second = (
@@ -535,15 +349,6 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
         runner.run(pass_frames())
     pieces = [0.01 * number for number in range(1, 7 if is_closed else 9)]
     assert arrived == pytest.approx(pieces, abs=STEP)
-
-
-@pytest.mark.parametrize("kind", ["corrupt", "truncate", "incomplete_set"])
-def test_wire_that_finds_damage_loses_the_frame(kind: FaultKind) -> None:
-    """As TCP does; late or doubled frames arrive."""
-    for fault, expected in ((kind, []), ("duplicate", [(0.0, FRAME)] * 2)):
-        faults = Faults((FaultWindow(fault=fault),))  # type: ignore[arg-type]
-        arrived = faults.pass_on(FRAME, toward="amplifier", time=1.0, finds_damage=True)
-        assert arrived == expected
 
 
 WATCHDOG = 0.25  # s
@@ -649,18 +454,6 @@ async def test_loss_is_detected_in_time(
             with noticed:
                 await at_work(hosted)
             assert threads.now() - begun <= bound
-
-
-@at_every_speed
-@in_virtual_time
-async def test_slow_wire_is_not_lost(wire: str, coarse_rig: Rig) -> None:
-    """None of 240 sets and heartbeats that occupy the whole wire is repeated."""
-    async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
-        for number in range(60):
-            await play(hosted, *(0.2 + 0.01 * (number % 2),) * 4)
-            for _ in range(3):
-                await hosted.group.beat()
-        assert hosted.group.amplifiers["main"].statistics.retries == 0
 
 
 def in_use() -> dict[str, int]:

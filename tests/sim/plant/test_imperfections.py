@@ -5,7 +5,6 @@ Channels are late and wrong in gain and phase; plates differ from their rigs.
 
 import cmath
 import math
-import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,10 +12,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drivers.playing import AmplifierTone, Playback
-from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.playing import AmplifierTone
 from kit.plates import FINGERTIP, lock_in
-from kit.plates import motion_of as positions_of
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement, Stimulus, together
 from model.arrays import FloatArray
@@ -25,15 +22,10 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.fingertips import Fingertip
-from model.transients.base_motion import BaseEnvelope, shaped
-from model.transients.plate_in_time import plate_in_time
-from model.transients.shaping import Transients
 from model.vibration import Tone as VibrationTone
-from sim.amplifier.amplifier_clock import StraightClock
 from sim.bench.bench import Bench
-from sim.plant.era_motions import motion_of
 from sim.plant.excited_plate import play as play_excitation
-from sim.plant.fingers import FingerRecord, PlateFingers, measure_vibration
+from sim.plant.fingers import PlateFingers
 from sim.plant.imperfections import (
     ChannelErrors,
     Imperfections,
@@ -44,7 +36,6 @@ from tests.sim.armed_bench import arm_bench, keep_alive, play
 
 FINGER = (0.08, 0.06)
 PERFECT = Imperfections()
-PERFECT_CLOCK = StraightClock(0.0, 0.0, 1.0)
 
 
 def record(
@@ -90,34 +81,6 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
     correct = settled_amplitude(two_amplifiers, PERFECT, "left", 0)
     unaffected = settled_amplitude(two_amplifiers, errors, "left", 0)
     assert unaffected == pytest.approx(correct, rel=1e-9)
-
-
-def test_imperfections_delay_lags_in_phase(two_amplifiers: Rig) -> None:
-    """A delay of 1 ms more is a lag of 39.6 degrees at 110 Hz."""
-    early = Imperfections(delays={"right": 0.002, "left": 0.002})
-    late = Imperfections(delays={"right": 0.003, "left": 0.0015})
-
-    early_amplitude = settled_amplitude(two_amplifiers, early, "right", 0)
-    late_amplitude = settled_amplitude(two_amplifiers, late, "right", 0)
-
-    lag = np.angle(early_amplitude / late_amplitude, deg=True)
-    assert lag == pytest.approx(39.6, abs=1e-4)
-
-
-def test_imperfections_second_harmonic_is_another_tone(two_amplifiers: Rig) -> None:
-    """A tenth of the motion at twice its frequency and phase, from its onset on."""
-    share = cmath.rect(0.1, math.radians(40))
-    errors = Imperfections({Channel("left", 0): ChannelErrors(harmonic=share)})
-    drive = {"left": [AmplifierTone(0, 110.0, 0.5, 25.0), AmplifierTone(1, 170.0, 0.2)]}
-    harmonic_drive = {"left": [AmplifierTone(0, 220.0, 0.05, 2 * 25.0 + 40.0)]}
-
-    _, distorted = record(two_amplifiers, errors, drive, duration=0.2)
-    _, plain = record(two_amplifiers, PERFECT, drive, duration=0.2)
-    _, harmonic = record(two_amplifiers, PERFECT, harmonic_drive, duration=0.2)
-
-    peak = np.abs(harmonic).max()
-    assert_allclose(distorted - plain, harmonic, rtol=0, atol=1e-3 * peak)
-    assert peak > 0.05 * np.abs(plain).max()
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.05])
@@ -256,20 +219,6 @@ def test_imperfect_plate_vibrates_as_a_rig_that_was_built_so(coarse_rig: Rig) ->
     assert change > 0.1 * np.abs(nominal).max()
 
 
-@pytest.mark.parametrize("errors", [{"gain": -0.1}, {"phase": math.nan}])
-def test_channel_errors_reject_negative_gains_and_nan(errors: dict[str, float]) -> None:
-    """A gain is at least 0, and all values are finite."""
-    with pytest.raises(InputError):
-        ChannelErrors(**errors)
-
-
-@pytest.mark.parametrize("delay", [-0.001, math.inf])
-def test_imperfections_reject_impossible_delays(delay: float) -> None:
-    """A delay is finite and not negative."""
-    with pytest.raises(InputError, match="delay"):
-        Imperfections(delays={"left": delay})
-
-
 def test_imperfections_reject_unknown_channels(two_amplifiers: Rig) -> None:
     """A channel without an ERA and an amplifier that the rig lacks are named."""
     unknown_channel = Imperfections({Channel("left", 7): ChannelErrors()})
@@ -278,73 +227,6 @@ def test_imperfections_reject_unknown_channels(two_amplifiers: Rig) -> None:
     unknown_amplifier = Imperfections(delays={"middle": 0.001})
     with pytest.raises(InputError, match="middle"):
         Bench(two_amplifiers, now=0.0, imperfections=unknown_amplifier)
-
-
-STROKE = 1e-4  # m
-
-
-def random_layer(chance: random.Random) -> LayerSet:
-    """Return a layer of one tone with envelopes."""
-    knots = []
-    for _ in range(3):
-        knots.append((chance.randrange(5000), chance.randrange(-9000, 9000)))
-    has_onset = chance.random() < 0.4
-    command = Command(
-        channel=0,
-        frequency=chance.choice((2000, 3000)),
-        level=chance.choice((0, 3000, 5000)),
-        phase=4500,
-        keep_phase=chance.random() < 0.5,
-        onset=Envelope(20, tuple(knots)) if has_onset else None,
-        ending=Envelope(10, tuple(knots[:2])),
-    )
-    return LayerSet(chance.randrange(2), chance.choice((0, 5, 30)), 0, (command,))
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.003])
-@pytest.mark.parametrize("seed", range(3))
-def test_base_moves_as_the_sum_of_its_voices(seed: int, delay: float) -> None:
-    """Fades, continued phases, envelopes and jumps of random sets agree within 1e-16 m."""
-    chance = random.Random(seed)
-    playback = Playback(1, 8)
-    now = 0.0
-    for token in range(1, 40):
-        playback.commit([random_layer(chance)], token, now)
-        voices = playback.all_voices[0]
-        motion = motion_of(voices, PERFECT_CLOCK, stroke=STROKE, delay=delay)
-        for _ in range(5):
-            now += chance.uniform(0.0005, 0.004)
-            expected = 0.0
-            for voice in voices:
-                omega = 2 * math.pi * voice.frequency
-                rotation = cmath.exp(1j * omega * now)
-                expected += STROKE * (voice.transition.at(now) * rotation).imag
-            times = np.array([now + delay])
-            (position,) = positions_of(motion, times)
-            assert position == pytest.approx(expected, abs=1e-16)
-
-
-def test_measured_vibration_separates_the_driven_frequencies() -> None:
-    """Two tones and a transient at neither: the amplitude of each tone, and the peak of all."""
-    times = 51234.5 + np.arange(3000) / 10_000
-    amplitudes = np.array([[2.0, 0.5], [0.3, 0.0]])
-    angle = 2 * np.pi * times
-    first_tone = np.sin(110 * angle + 1.0)
-    second_tone = np.cos(170 * angle - 2.0)
-    tones = np.outer(first_tone, amplitudes[0]) + np.outer(second_tone, amplitudes[1])
-    decay = np.exp(-(times - times[0]) / 0.02)
-    transient = 0.4 * decay * np.sin(163.3 * angle)
-    samples = tones + transient[:, None]
-    points = np.zeros((2, 2))
-    weights = np.full(2, 0.5)
-    frequencies = [110.0, 170.0]
-
-    vibration = measure_vibration(FingerRecord(points, weights, times, samples), frequencies)
-    undisturbed = measure_vibration(FingerRecord(points, weights, times, tones), frequencies)
-
-    assert_allclose(vibration.amplitude, amplitudes, atol=0.03)
-    assert_allclose(vibration.peak, np.abs(samples).max(axis=0), rtol=0.005)
-    assert_allclose(undisturbed.amplitude, amplitudes, atol=1e-7)
 
 
 @pytest.mark.parametrize("position", [(0.4, 0.1), (math.nan, 0.1), (0.1, -1e-3)])
@@ -368,31 +250,6 @@ def test_fingers_stay_where_they_are_when_one_is_off_the_plate(
 FINGERS = Placement(((0.10, 0.03),), ((0.22, 0.16),))
 """A targeted and a quiet finger."""
 EXCITATION = {"SW": VibrationTone(110.0, 1e-5)}
-COMMON_RATE = 2000  # Hz, of which both sampling rates are multiples
-
-
-def test_playback_with_an_onset_agrees_with_the_transients_of_the_model(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
-    """The accelerations of fingertips agree within 1e-6 of the peak."""
-    onset = {
-        "SW": BaseEnvelope(110.0, 2e-6, (4e-6j, -1e-5, 1e-5)),
-        "NE": BaseEnvelope(110.0, 0, (5e-6, 0)),
-    }
-    rig = replace(coarse_rig, fingertip=None)
-    layer = Layer(EXCITATION, onset=onset)
-    transients = Transients(plate_in_time(reduced, rig.eras))
-
-    played = play_excitation(rig, reduced, [layer], together(FINGERS, Stimulus()), duration=None)
-
-    assert played.settled == pytest.approx(0.015)
-    motions = shaped(onset, rig.eras)
-    for finger in (*played.targets, *played.quiet):
-        expected = transients.acceleration(motions, finger.points, duration=0.2)
-        common = slice(4, 1999, 5)
-        assert_allclose(finger.times[common] * COMMON_RATE, np.arange(1, 400))
-        tolerance = 1e-6 * np.abs(expected).max()
-        assert_allclose(finger.accelerations[common], expected[4::4], atol=tolerance)
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ from processes.sound_cards import BLOCK as CARD_BLOCK
 from processes.sound_cards import RATE as CARD_RATE
 from processes.sound_cards import SoftAmp, jack_server
 from sim.soft_amp.engine import Counters, library, start_engine
-from sim.soft_amp.output import default_block, may_be_realtime, portaudio_device, portaudio_stream
+from sim.soft_amp.output import may_be_realtime, portaudio_device, portaudio_stream
 from sim.soft_amp.settings import (
     Law,
     Protocol,
@@ -214,15 +214,6 @@ def test_more_than_16_channels_are_two_amplifiers() -> None:
     assert urls == ["modbus+tcp://h:1/1", "modbus+tcp://h:1/2"]
 
 
-def test_missing_engine_is_an_error_with_a_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error names the library to install."""
-    monkeypatch.setattr("sim.soft_amp.engine.ENGINE_FILE", tmp_path / "missing.so")
-    with pytest.raises(InputError, match="apt install gcc libc6-dev"):
-        library.__wrapped__()
-
-
 def test_link_follows_the_terminal_and_has_one_user(tmp_path: Path) -> None:
     """It leads to the terminal while that is open; a file in its place is left alone."""
     link = tmp_path / "amp"
@@ -236,17 +227,6 @@ def test_link_follows_the_terminal_and_has_one_user(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no symbolic link"), terminal_place(link):
         pass
     assert link.read_text() == "mine"
-
-
-@pytest.mark.parametrize("is_realtime", [False, True])
-def test_block_is_shorter_than_a_reply_may_take(
-    is_realtime: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At 48 kHz, with and without real-time priority: the protocol allows 10 ms."""
-    library = SimpleNamespace(query_hostapis=lambda _number: {"name": "ALSA"})
-    monkeypatch.setattr("sim.soft_amp.output.sounddevice", lambda: library)
-    monkeypatch.setattr("sim.soft_amp.output.may_be_realtime", lambda: is_realtime)
-    assert default_block({"hostapi": 0}) / 48_000 < 0.01
 
 
 @pytest.mark.parametrize(

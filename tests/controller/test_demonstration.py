@@ -119,20 +119,6 @@ def test_felt_contrast_relates_levels_not_accelerations() -> None:
     assert steady_contrast_db(target, []) is None
 
 
-def test_felt_contrast_is_the_least_over_the_threshold_sets() -> None:
-    """A target at 250 Hz beside 100 Hz, each at the same level by the first set.
-
-    By hand, of the thresholds on the page about people: by the second set the target is higher by
-    28 dB and the other by 31, so that the contrast is 3 dB less.
-    """
-    low, high = detection_threshold(np.array([100.0, 250.0]))
-    sets = ("vibrotactile-probe", "pressing-fingertip")
-    target = replace(vibration([[0.0], [10 * high]]), thresholds=sets)
-    single = vibration([[10 * low], [0.0]])
-    assert target.level_db_sl == pytest.approx(single.loudest_db_sl)
-    assert steady_contrast_db(target, [single]) == pytest.approx(-3.0, abs=0.2)
-
-
 def test_contents_are_told_apart_by_their_frequencies() -> None:
     """By hand: 10 times threshold of its own, 0.3 and 0.4 of others: 26 dB above their power."""
     thresholds = detection_threshold(np.array([90.0, 170.0, 260.0]))

@@ -8,7 +8,6 @@ import io
 import json
 import logging
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -22,19 +21,16 @@ from textwrap import dedent
 from unittest.mock import Mock
 
 import pytest
-import typer
-from typer.core import TyperGroup
 
 from controller.cli.daemon_cli import position_on
 from controller.daemon.children import gateway_options
 from controller.process.daemon_process import SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
-from era_haptics.command import command_modules, main
 from model.errors import InputError
 from packages import PACKAGES
 from processes.gateways import wait_for
 from processes.interrupted import full_disk
-from registry.command_line import LoadModules, join_commands, run
+from registry.command_line import LoadModules, run
 from registry.service_manager import ServiceManager
 
 
@@ -173,22 +169,6 @@ def test_socket_lock_refuses_folders_that_others_can_change_and_long_paths(
     monkeypatch.setattr(Path, "lstat", lambda path: theirs)
     with pytest.raises(InputError, match=str(link)):
         SocketLock(link / "era.sock")
-
-
-@pytest.mark.parametrize("kind", ["file", "folder", "link"])
-def test_socket_lock_leaves_other_files_alone(tmp_path: Path, kind: str) -> None:
-    """Whatever is no socket is refused before anything is created."""
-    path = tmp_path / "there"
-    match kind:
-        case "file":
-            path.write_text("mine", encoding="utf-8")
-        case "folder":
-            path.mkdir()
-        case _:
-            path.symlink_to(tmp_path / "nowhere")
-    with pytest.raises(InputError, match=str(path)):
-        SocketLock(path)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["there"]
 
 
 MODULE = "era_test_commands"
@@ -431,19 +411,6 @@ def test_help_loads_commands_and_typer_alone(command: str, own_modules: set[str]
     assert set(loaded) - set(PACKAGES) - typers - of_the_environment - own_modules == set()
 
 
-def test_summaries_of_commands_fit_in_80_columns() -> None:
-    """Help lists each command with the whole first sentence of its own help."""
-    group, _ = join_commands(command_modules())
-    groups = [(group, typer.Context(group, info_name="era", terminal_width=80))]
-    for name, command in group.commands.items():
-        if isinstance(command, TyperGroup):
-            groups.append((command, typer.Context(command, info_name=name, terminal_width=80)))
-    assert len(groups) > 5
-    for listed, context in groups:
-        lines = listed.get_help(context).splitlines()
-        assert [line for line in lines if line.endswith("...") and "Usage" not in line] == []
-
-
 @pytest.mark.parametrize(
     ("typed", "words"),
     [("era con", {"config", "content"}), ("era content check tick --qu", {"--quiet"})],
@@ -467,18 +434,6 @@ def test_bash_completes_commands_and_options(typed: str, words: set[str]) -> Non
     )
     assert done.stderr == ""
     assert {*done.stdout.split()} == words
-
-
-def test_main_loads_every_package_of_the_project(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Without a warning."""
-    monkeypatch.setattr(sys, "argv", ["era", "--help"])
-    monkeypatch.setattr(signal, "signal", lambda *_: None)  # keep those of pytest
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.setenv(variable, "1")  # main sets them; restored after the test
-    assert main() == 0
-    assert capsys.readouterr().err == ""
 
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:

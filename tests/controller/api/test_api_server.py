@@ -5,23 +5,18 @@ Clients and server are in memory and in virtual time, which stands still while l
 
 import asyncio
 import json
-import socket
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import groupby
-from pathlib import Path
 from typing import Final
-from unittest.mock import Mock
 
 import pytest
 
 from controller.api import server
 from controller.api.jsonrpc import ErrorCode
-from controller.api.methods import StatusResult
-from controller.api.server import MAX_UNREAD_BYTES, ApiServer
+from controller.api.server import MAX_UNREAD_BYTES
 from kit.api_parameters import API_PARAMETERS
 from kit.clock import feed, in_virtual_time
-from processes.daemons import PATIENCE, ServedApi, request, serving
+from processes.daemons import ServedApi, request, serving
 
 RESULT: Final = "result"
 RATE_LIMIT = 2000
@@ -121,29 +116,6 @@ def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 def long_turns(one_line_a_turn: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Serve all lines of a client in one turn."""
     monkeypatch.setattr(server, "MAX_TURN", 1.0)
-
-
-@in_virtual_time
-async def test_server_continues_after_invalid_lines() -> None:
-    """Each invalid line gets an error; the line after it is served."""
-    api = timed_api()
-    client = MemoryClient(api)
-
-    await client.ask(
-        b"garbage\n\n\xff\n[]\n",
-        line("no_such_method", 1),
-        request("effects", '{"x":1}', id=2),
-        line("disarm", 9),
-    )
-
-    assert client.responses() == [
-        *[(None, ErrorCode.PARSE)] * 3,
-        (None, ErrorCode.INVALID_REQUEST),
-        (1, ErrorCode.UNKNOWN_METHOD),
-        (2, ErrorCode.INVALID_PARAMS),
-        (9, RESULT),
-    ]
-    assert api.names == ["disarm"]
 
 
 @in_virtual_time
@@ -467,44 +439,6 @@ async def test_place_is_taken_from_the_client_that_is_idle_for_longest() -> None
 
 
 @in_virtual_time
-async def test_place_is_taken_from_a_client_that_has_asked_more_than_a_second_ago() -> None:
-    """Rather than from one that has waited for a response since before that."""
-    api = timed_api()
-    waiting = MemoryClient(api)
-    await waiting.ask(line("arm", 1))
-    await asyncio.sleep(1.9)
-    idle = MemoryClient(api)
-    await idle.ask(ASKING)
-    await asyncio.sleep(1.1)
-    clients = connect(api, 30)
-    await ask_in_turn(clients, ASKING)
-
-    new = MemoryClient(api)
-
-    assert not new.connection.is_reserve
-    assert not idle.is_open
-    assert places([waiting, *clients, new]) == 32
-
-
-@in_virtual_time
-async def test_client_in_reserve_survives_a_process_that_connects_again_and_again() -> None:
-    """Before its first bytes and after them; the reserve of eight stays bounded."""
-    api = timed_api()
-    first = connect(api, 32)
-    client = MemoryClient(api, process=4711)
-    flood = list[MemoryClient]()
-
-    for id, method in enumerate(["hello", "stop", "disarm"]):
-        for _ in range(1000):
-            await asyncio.sleep(0.0002)
-            flood.append(MemoryClient(api))
-        await client.ask(line(method, id))
-        assert client.responses() == [(id, RESULT)]
-
-    assert [places(first), places([client]), places(flood)] == [32, 1, 7]
-
-
-@in_virtual_time
 async def test_bug_in_a_method_is_reported_without_details(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -516,36 +450,6 @@ async def test_bug_in_a_method_is_reported_without_details(
     assert b"/a/path" not in client.wire.waiting
     assert client.responses() == [(1, ErrorCode.INTERNAL)]
     assert "/a/path" in caplog.text
-
-
-@pytest.mark.usefixtures("long_turns")
-@in_virtual_time
-async def test_result_that_cannot_be_sent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of a text that is not Unicode; the next line is served in the same turn."""
-    monkeypatch.setattr(StatusResult, "model_dump_json", Mock(side_effect=UnicodeError))
-    client = MemoryClient(timed_api())
-
-    await client.ask(line("status", 1), line("disarm", 2))
-
-    assert client.responses() == [(1, ErrorCode.INTERNAL), (2, RESULT)]
-
-
-async def test_connection_that_is_accepted_amid_closing_is_closed(tmp_path: Path) -> None:
-    """However far it has come when the server looks at those that are open."""
-    for iterations in range(6):
-        api = ApiServer({}, on_disconnect=Mock(), holds_lease=lambda client: False)
-        path = str(tmp_path / f"{iterations}.sock")
-        listener = socket.socket(socket.AF_UNIX)
-        listener.bind(path)
-        await api.open(listener)
-        with socket.socket(socket.AF_UNIX) as client:
-            client.connect(path)
-            await iterate(iterations)
-            await api.close()
-            client.setblocking(False)
-            with suppress(ConnectionResetError):  # it was never accepted
-                async with asyncio.timeout(PATIENCE / 6):
-                    assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
 
 
 def fail(*_: object) -> None:

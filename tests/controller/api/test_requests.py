@@ -13,11 +13,8 @@ from controller.api.jsonrpc import (
     error_line,
     read_params,
     read_request,
-    request_line,
-    result_line,
 )
-from controller.api.methods import METHODS, ArmParams, SubscribeParams
-from controller.api.schema import ApiMessage, Empty
+from controller.api.methods import METHODS
 from processes.daemons import request
 
 TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
@@ -36,37 +33,6 @@ def test_request_of_the_specification_is_read() -> None:
 
     assert (example.method, example.id, example.expects_response) == ("subtract", 3, True)
     assert example.params == {"subtrahend": 23, "minuend": 42}
-
-
-@pytest.mark.parametrize(
-    ("member", "expects_response"),
-    [("", False), (',"id":null', True), (',"id":"a"', True)],
-    ids=["no id", "null", "text"],
-)
-def test_request_without_an_id_expects_no_response(member: str, *, expects_response: bool) -> None:
-    """By JSON-RPC 2.0 a notification lacks the member; null is an id."""
-    line = f'{{"jsonrpc":"2.0","method":"stop"{member}}}'
-    assert read_request(line.encode()).expects_response is expects_response
-
-
-@pytest.mark.parametrize(
-    "params",
-    [
-        ArmParams(owner="Zoë", lease_s=5.0),
-        SubscribeParams(topics=["state"], rate_hz=None),
-        SubscribeParams(topics=["amplifiers", "log"], rate_hz=60.0),
-        Empty(),
-    ],
-    ids=str,
-)
-def test_server_reads_what_a_client_has_written(params: ApiMessage) -> None:
-    """The id and all parameters."""
-    values = params.model_dump_json(exclude_none=True)
-
-    written = read_request(request_line(7, "any", values.encode()))
-
-    assert written.id == 7
-    assert read_params(type(params), written) == params
 
 
 @pytest.mark.parametrize(
@@ -178,24 +144,6 @@ def test_parameter_that_is_wrong_is_refused_with_its_key(
     assert caught.value.code is ErrorCode.INVALID_PARAMS
     assert caught.value.data.where == key
     assert caught.value.data.remedy
-
-
-def test_result_has_the_members_of_the_specification() -> None:
-    """The result object of JSON-RPC 2.0, in a line."""
-    response = json.loads(result_line("a", '{"lease":"x"}'))
-    assert response == {"jsonrpc": "2.0", "id": "a", "result": {"lease": "x"}}
-
-
-def test_error_has_the_members_of_the_specification() -> None:
-    """The error object of JSON-RPC 2.0, in one line though a text has two."""
-    error = RpcError(ErrorCode.WRONG_STATE, "the\nplate", where="state", remedy="arm first")
-
-    line = error_line(None, error)
-
-    assert line.count(b"\n") == 1
-    data = {"what": "the\nplate", "where": "state", "remedy": "arm first"}
-    expected = {"code": 1001, "message": "the\nplate; arm first", "data": data}
-    assert json.loads(line) == {"jsonrpc": "2.0", "id": None, "error": expected}
 
 
 @given(st.binary(max_size=200))

@@ -79,33 +79,6 @@ def test_wav_bands_are_added_and_energy_outside_them_is_reported(read: Read) -> 
     assert pattern.remarks == ("50 % of its energy (-3.0 dB) is outside 65 to 300 Hz and left out",)
 
 
-@pytest.mark.parametrize(
-    ("rate", "seconds", "start", "end"),
-    [
-        (44_100, 1, 0.3, 0.5),
-        (1009, 53, 50.0, 50.2),  # a prime rate, with as many samples as a long file of 48 kHz
-    ],
-)
-def test_wav_burst_starts_and_ends_in_time(
-    read: Read, rate: int, seconds: int, start: float, end: float
-) -> None:
-    """Half of its intensity is passed within 10 ms of the start and of the end."""
-    time = np.arange(rate * seconds) / rate
-    is_burst = (time > start) & (time < end)
-    signal = np.where(is_burst, 0.8 * np.sin(2 * np.pi * 150 * time), 0)
-
-    pattern = read("wav", wav_file(signal.astype(np.float32), rate))
-
-    times, intensities = np.array(pattern.intensity).T
-    fine_times = np.arange(start - 0.3, end + 0.3, 0.001)
-    loud_times = fine_times[np.interp(fine_times, times, intensities) > 0.4]
-    assert loud_times[0] == pytest.approx(start, abs=0.01)
-    assert loud_times[-1] == pytest.approx(end, abs=0.01)
-    assert intensities.max() == pytest.approx(0.8, abs=0.03)
-    is_outside = (times < start - 0.05) | (times > end + 0.05)
-    assert not intensities[is_outside].any()
-
-
 def chunk(name: bytes, content: bytes, size: int | None = None, order: str = "<") -> bytes:
     """Return a chunk of the specification; size: the stated one, None for the true one."""
     stated = len(content) if size is None else size

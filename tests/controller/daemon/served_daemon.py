@@ -10,14 +10,12 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 
 from controller.api.client import AsyncClient
 from controller.api.methods import StatusResult
-from controller.api.schema import ApiMessage
 from controller.cli.status_text import show_status
 from controller.demo.demonstration import layout_of_people
 from controller.operation.operation_states import Operation
@@ -142,11 +140,6 @@ class ServedDaemon:
             assert event is not None, f"no event of {topic} with {expected}"
             if event.topic == topic and event.data.items() >= expected.items():
                 return cast(Mapping[str, Any], event.data)
-
-    async def request_unchecked(self, method: str, **params: object) -> None:
-        """Request a method with parameters that its client would refuse."""
-        unchecked = SimpleNamespace(model_dump_json=lambda **_: json.dumps(params))
-        await self.era.request(method, cast(ApiMessage, unchecked))
 
     def expire_lease(self) -> None:
         """Let the lease be over."""

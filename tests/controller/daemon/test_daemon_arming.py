@@ -144,36 +144,6 @@ async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
         await daemon.hear("state", new=READY)
 
 
-@in_virtual_time
-async def test_stop_with_a_parameter_of_a_later_version_silences_the_plate() -> None:
-    """Its error comes once every amplifier is silent."""
-    async with served_daemon() as daemon:
-        await daemon.era.arm("me", lease_s=60)
-
-        request = daemon.request_unchecked("stop", client="hmi", reason="door open")
-        assert await error_code(request) is ErrorCode.INVALID_PARAMS
-
-        status = await daemon.era.status()
-        assert (status.state, status.cause) == (STOPPED, "stopped by 'hmi'")
-        assert daemon.amplifier_state == STOPPED
-
-
-@in_virtual_time
-async def test_disarm_with_a_parameter_of_a_later_version_silences_the_plate() -> None:
-    """One that is restricted to another lease does not."""
-    async with served_daemon() as daemon:
-        await daemon.era.arm("me", lease_s=60)
-
-        restricted = daemon.request_unchecked("disarm", lease="another", reason="door open")
-        assert await error_code(restricted) is ErrorCode.LEASE
-        assert (await daemon.era.status()).state == ENABLED
-
-        request = daemon.request_unchecked("disarm", reason="door open")
-        assert await error_code(request) is ErrorCode.INVALID_PARAMS
-        assert (await daemon.era.status()).state == READY
-        assert daemon.amplifier_state == DISARMED
-
-
 @pytest.mark.parametrize("is_latched", [True, False], ids=["method", "method and transition"])
 @in_virtual_time
 async def test_stop_that_fails_on_its_way_stops_the_amplifiers(
@@ -270,24 +240,3 @@ async def test_status_tells_a_lost_amplifier_from_one_that_is_closed_with_it() -
         daemon.recover("side")
         await wait_for_connections(daemon, main="lost", side="closed")
         assert await error_code(era.disarm()) is ErrorCode.NOT_SILENT
-
-
-@in_virtual_time
-async def test_status_tells_why_a_lost_amplifier_stays_lost() -> None:
-    """Another one answers; with the first one back, the reason for the loss is still named."""
-    async with served_daemon() as daemon:
-        identity = daemon.bench.far.device.identity
-        daemon.hang()
-        identity["serial_number"] = "A1"
-        await daemon.reach("COMM_LOST")
-        assert "no reply" in (await daemon.era.status()).cause
-
-        daemon.recover()
-        status = await daemon.status_when(lambda status: "A1" in status.cause)
-        assert "cables" not in (status.remedy or "")
-
-        identity["serial_number"] = "SIM-main"
-        await daemon.era.subscribe("state")
-        state = await daemon.hear("state", new=DISARMED)
-        assert "before: " in state["cause"]
-        assert "no reply" in state["cause"]

@@ -7,9 +7,6 @@ it is read in another process, and what it costs the loop.
 import asyncio
 import itertools
 import json
-import os
-import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -22,15 +19,13 @@ from controller.cli.config_cli import config_app
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DAEMON, DaemonConfig, DaemonSection, load_daemon_config
 from controller.daemon.reload import config_change
-from controller.process.child import child_command
 from controller.sources.touch import Touch
 from kit.clock import in_virtual_time
 from kit.plates import TWO_AMPLIFIERS, write_rig
 from model.config.document import ConfigError
 from model.errors import InputError
-from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path
 from processes.daemons import ENABLED, ready_daemon
-from sim.memory_line import SimulationUrl
 
 RUNNER = CliRunner()
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -79,16 +74,6 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert default_socket(named) == Path("/a/b.sock")
     assert default_socket({"XDG_RUNTIME_DIR": "/run/x"}) == Path("/run/x/era-haptics/daemon.sock")
     assert default_socket({}).name == "daemon.sock"
-
-
-def test_config_of_a_folder_that_is_not_utf8(folder: Path) -> None:
-    """Names of files are bytes: the simulated amplifier finds its rig; `~` may have no home."""
-    strange = folder / os.fsdecode(b"pr\xfcf stand #1")
-    strange.mkdir()
-    (folder / "rig.yaml").rename(strange / "rig.yaml")
-    url = load_daemon_config(written(strange)).urls["main"]
-    assert load_rig(SimulationUrl(url).rig).eras[0].name == "SW"
-    assert problems(written(strange, rig="~no-such-user/rig.yaml")) == [(1, "rig")]
 
 
 def test_config_paths_are_relative_to_its_folder(
@@ -401,14 +386,3 @@ def test_plugin_installed_meanwhile_needs_a_restart(
     (folder / "daemon.yaml").write_text("rig: rig.yaml\nlayouts: {panel: layout.yaml}\n")
     with pytest.raises(InputError, match="restart the daemon"):
         read_in_child(folder / "daemon.yaml", FREQUENCIES)
-
-
-def test_child_ends_by_none_of_the_daemons_own_signals() -> None:
-    """A signal to the whole service reopens the log or does nothing; SIGTERM ends a child."""
-    command = child_command("http.server", "0")
-    quick = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=quick) as child:
-        child.stdout.readline()  # it serves
-        for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGTERM):
-            child.send_signal(number)
-        assert child.wait(20) == -signal.SIGTERM

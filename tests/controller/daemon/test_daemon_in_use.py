@@ -23,7 +23,6 @@ from typer.testing import CliRunner
 
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.schema import ContactStatus
 from controller.cli.commands import app
 from controller.cli.status_text import show_status
 from controller.daemon.children import gateway_options
@@ -452,27 +451,6 @@ async def test_readings_are_shown_with_their_unit_to_their_step(tmp_path: Path) 
             assert getattr(status.amplifiers[0], reading.key) == pytest.approx(value)
             places = reading.key in pages, f" {reading.label} " in show_status(status)
             assert places == ("page" in reading.views, "status" in reading.views)
-
-
-@in_virtual_time
-async def test_status_shows_levels_of_one_threshold_set_and_names_it(tmp_path: Path) -> None:
-    """20 dB SL of its own beside 5.4 of others, not 33.4, which is by the most sensitive set."""
-    async with ready_daemon(tmp_path) as (_, era):
-        status = await era.status()
-    assert "thresholds" not in show_status(status)  # no level is shown
-    finger = ContactStatus(
-        source="panel",
-        id=1,
-        x_m=0.1,
-        y_m=0.1,
-        role="target",
-        level_db_sl=20.0,
-        foreign_level_db_sl=33.4,
-        rig_foreign_level_db_sl=5.4,
-    )
-    text = show_status(status.model_copy(update={"contacts": [finger]}))
-    assert "levels above the thresholds of vibrotactile-probe" in text
-    assert "20.0 dB SL, others at most 5.4 dB SL" in text
 
 
 def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:

@@ -54,37 +54,6 @@ async def hold_for(daemon: ServedDaemon, seconds: float) -> StatusResult:
 
 
 @in_virtual_time
-async def test_reload_applies_a_layout_alone() -> None:
-    """While armed, a lower level is applied, but no higher or invalid one, nor any other change."""
-    level = "level_db_sl: 20"
-    async with served_daemon(further_lines=f"{level}\n# more\n") as daemon:
-        config = daemon.bench.daemon.config
-        await daemon.era.arm("me", lease_s=30)
-
-        assert await daemon.reload_with((level, "level_db_sl: 10")) == ""
-        assert daemon.bench.daemon.config.section.level_db_sl == 10
-        daemon.hold(daemon.era, "pad")
-        await until(lambda: daemon.is_loud)
-        status = await hold_for(daemon, 0.05)
-        assert 10 <= min(levels_of(status)) <= 16
-        daemon.lift()
-
-        assert "while armed" in await daemon.reload_with((level, "level_db_sl: 21"))
-        assert "level_db_sl" in await daemon.reload_with((level, "level_db_sl: loud"))
-        lower = (level, "level_db_sl: 5")
-        assert "rig: " in await daemon.reload_with(lower, ("rig: rig", "rig: bench"))
-        dashboard = ("# more", "dashboard: 127.0.0.1:1")
-        assert "dashboard: " in await daemon.reload_with(lower, dashboard)
-        assert daemon.bench.daemon.config.section.level_db_sl == 10
-
-        await daemon.era.disarm()
-        await daemon.reach(READY)
-        assert await daemon.reload_with((level, "level_db_sl: 21")) == ""
-        assert daemon.bench.daemon.config.section.level_db_sl == 21
-        assert config.section.level_db_sl == 20
-
-
-@in_virtual_time
 async def test_status_has_the_reasons_of_now_and_latencies_of_touches_apart() -> None:
     """Four touches, one of them a move; three lifts and the arming count as lifts."""
     async with served_daemon() as daemon:

@@ -101,29 +101,6 @@ def test_click_ends_after_its_duration() -> None:
     assert "click" in surface.intent.reason
 
 
-@pytest.mark.parametrize(("requested", "level"), [(None, 20.0), ("hum", 9.0)])
-def test_finger_that_returns_with_the_same_id_is_new(requested: str | None, level: float) -> None:
-    """It is known by when it came down, and feels its press or what is requested."""
-    effects = {"click": Click(), "hum": Buzz(level=9.0)}
-    surface = Surface(layout_of(effects=effects, elsewhere="click"))
-    surface.must_feel(0.0, {1: 20.0}, ON_LEFT)
-    surface.must_feel(1.0, {}, ON_LEFT)
-    returned = finger(1, since=1.98)
-    if requested:
-        surface.play(requested, returned, 2.0)
-    surface.must_feel(2.0, {1: level}, returned)
-
-
-def test_buzz_lasts_while_the_finger_stays() -> None:
-    """A new finger starts it again."""
-    surface = Surface(SurfaceLayout())
-    surface.must_feel(0.0, {1: 20.0}, ON_LEFT)
-    surface.must_feel(100.0, {1: 20.0}, ON_LEFT)
-    assert surface.intent.until == math.inf
-    surface.must_feel(101.0, {})
-    surface.must_feel(102.0, {1: 20.0}, ON_LEFT)
-
-
 def test_finger_on_an_edge_keeps_its_region() -> None:
     """Half a millimeter of noise is no crossing; a millimeter is."""
     effects = {"tick": Click(level=10.0), "tock": Click(level=15.0)}
@@ -163,34 +140,6 @@ def test_newest_finger_outside_of_all_regions_feels_the_effect_there() -> None:
     surface.must_feel(0.3, {1: 20.0}, first, ALSO_ON_RIGHT)
 
 
-def test_intent_expires_at_the_first_end_of_a_pulse() -> None:
-    """A detent of 30 ms ends first, then the wait and the end of a neighbor's click of 40 ms."""
-    effects = {"dots": Detents(duration=0.03), **CLICK}
-    surface = Surface(layout_of(left(on_move="dots"), effects=effects, elsewhere="click"))
-    surface.feel(0.0, ON_LEFT)
-    moved = finger(1, 0.056)
-    surface.must_feel(1.0, {1: 20.0}, moved, ON_RIGHT)
-    surface.feel(1.001, moved, ON_RIGHT)
-    assert surface.intent.until == pytest.approx(1.03)
-    surface.must_feel(1.03, {}, moved, ON_RIGHT)
-    assert surface.intent.until == pytest.approx(1.06)
-    surface.must_feel(1.0601, {2: 20.0}, moved, ON_RIGHT)
-    surface.feel(1.07, moved, ON_RIGHT)
-    assert surface.intent.until == pytest.approx(1.1001)
-
-
-def test_clicks_of_fingers_are_60_ms_apart() -> None:
-    """The second and the third wait, and play for their whole duration."""
-    surface = Surface(layout_of(left(on_press="click"), right("click"), effects=CLICK))
-    fingers = ON_LEFT, ON_RIGHT, ALSO_ON_RIGHT
-    surface.must_feel(1.0, {1: 20.0}, *fingers)
-    surface.must_feel(1.059, {}, *fingers)
-    surface.must_feel(1.0601, {2: 20.0}, *fingers)
-    surface.must_feel(1.0999, {2: 20.0}, *fingers)
-    surface.must_feel(1.1201, {3: 20.0}, *fingers)
-    surface.must_feel(1.1602, {}, *fingers)
-
-
 def test_waiting_click_is_replaced_in_its_place() -> None:
     """The second is requested at 10 and 15 ms and plays once, at 60; the first waits, but lifts."""
     surface = Surface(layout_of(effects=CLICK))
@@ -208,16 +157,6 @@ def test_waiting_click_is_replaced_in_its_place() -> None:
     surface.must_feel(0.1201, {3: 20.0}, ON_RIGHT, ALSO_ON_RIGHT)
 
 
-def test_run_without_a_stimulus_leaves_others_their_effects() -> None:
-    """A finger between detents of a region feels nothing."""
-    effects = {"dots": Detents(), "buzz": Buzz()}
-    surface = Surface(layout_of(left(on_move="dots"), effects=effects, elsewhere="buzz"))
-    outside = finger(1, 0.15)
-    surface.must_feel(0.0, {1: 20.0}, outside, finger(2, 0.05))
-    surface.must_feel(0.1, {1: 20.0, 2: 20.0}, outside, finger(2, 0.056))
-    surface.must_feel(0.2, {1: 20.0}, outside, finger(2, 0.056))
-
-
 def test_requested_effect_precedes_all_regions_until_it_ends() -> None:
     """It has the requested level, also at a new finger, whose own effect continues afterwards."""
     effects = {"buzz": Buzz(), "alert": Click(duration=0.1)}
@@ -230,17 +169,6 @@ def test_requested_effect_precedes_all_regions_until_it_ends() -> None:
     surface.play("alert", ALSO_ON_RIGHT, 1.0, level=12.0)
     surface.must_feel(1.0, {3: 12.0}, ALSO_ON_RIGHT)
     surface.must_feel(1.2, {3: 20.0}, ALSO_ON_RIGHT)
-
-
-def test_requested_effect_ends_with_its_finger() -> None:
-    """It continues through other regions, unlike the effect of a region."""
-    effects = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
-    surface = Surface(layout_of(left(on_press="hum"), Region("right", RIGHT), effects=effects))
-    surface.must_feel(0.0, {1: 9.0}, ON_LEFT)
-    surface.play("alert", ON_LEFT, 0.2)
-    surface.must_feel(0.2, {1: 18.0}, finger(1, 0.15))
-    surface.must_feel(3.0, {})
-    surface.must_feel(4.0, {1: 9.0}, finger(1, since=4.0))
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -264,31 +192,6 @@ def test_new_layout_repeats_no_press(times: int) -> None:
     surface.must_feel(3.0, {1: 20.0}, ON_LEFT)
     surface.replace(times=1)
     surface.must_feel(4.0, {1: 20.0}, finger(1, since=3.5))
-
-
-def test_press_outlasts_its_layout_near_an_older_finger() -> None:
-    """The newest finger outside of all regions stays the newest, though the older starts again."""
-    effects = {"press": Buzz(duration=1.0, level=12.0), "buzz": Buzz(level=9.0)}
-    surface = Surface(layout_of(effects=effects, elsewhere="press"))
-    newest = finger(2, since=0.5)
-    surface.feel(0.0, ON_LEFT)
-    surface.feel(0.5, ON_LEFT, newest)
-    surface.player.replace(layout_of(effects=effects, elsewhere="buzz"))
-    surface.must_feel(1.2, {2: 12.0}, ON_LEFT, newest)
-    surface.must_feel(1.6, {2: 9.0}, ON_LEFT, newest)
-
-
-def test_every_finger_in_a_region_feels_its_effect() -> None:
-    """Outside of all regions the newest alone; each with its level, priority and content."""
-    region = Region("left", LEFT, on_press="soft", on_move=None, priority=3)
-    effects = {"soft": Buzz(level=9.0), "buzz": Buzz()}
-    player = EffectPlayer(layout_of(region, effects=effects, elsewhere="buzz"))
-    fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16), finger(4, 0.06)]
-    targets = [
-        (target.key.id, target.level_db_sl, target.priority, target.content)
-        for target in player.intent(fingers, 0.0).targets
-    ]
-    assert targets == [(2, 9.0, 3, "soft"), (3, 20.0, 0, "buzz"), (4, 9.0, 3, "soft")]
 
 
 @pytest.mark.parametrize(
@@ -349,12 +252,6 @@ def test_texture_level_follows_speed(speed: float, level: float) -> None:
     assert stimulus.until is not None
     assert 0.08 <= stimulus.until - 0.18 <= 0.0901
     assert run.feel(finger(1, way), stimulus.until) == NoStimulus()
-
-
-def test_texture_is_not_felt_below_its_slow_speed() -> None:
-    """A tenth less than `slow` is no movement."""
-    stimulus, _ = slide(texture_run(0.01, 0.16, 16.0), 0.009)
-    assert isinstance(stimulus, NoStimulus)
 
 
 def test_texture_starts_with_the_movement() -> None:
@@ -424,51 +321,6 @@ def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> 
     pauses = [later - sooner for (sooner, _), (later, _) in pairwise(starts)]
     assert min(pauses) >= 0.06 - 1e-9
     assert max(pauses) <= 0.07
-
-
-class Endless(Buzz, EffectRun):
-    """An effect that never ends, and records when it is felt."""
-
-    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Return itself."""
-        return self
-
-    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Record the time."""
-        FELT_TIMES.append(now)
-        return EffectStimulus(20.0)
-
-
-FELT_TIMES: list[float] = []
-"""When the endless effect was felt [s]."""
-
-
-def test_effect_that_is_requested_a_thousand_times_runs_once() -> None:
-    """It has no end."""
-    FELT_TIMES.clear()
-    surface = Surface(layout_of(effects={"hum": Endless()}))
-    for number in range(1000):
-        surface.play("hum", ON_LEFT, 0.001 * number)
-    surface.feel(2.0, ON_LEFT)
-    assert FELT_TIMES == [2.0]
-
-
-@pytest.mark.parametrize(
-    ("name", "requested", "level", "above"),
-    [("click", None, 20.0, 6.0), ("click", 18.0, 18.0, None), ("soft", None, 15.0, None)],
-)
-def test_click_is_felt_in_addition_to_the_buzz_of_its_finger(
-    name: str, requested: float | None, level: float, above: float | None
-) -> None:
-    """6 dB above it if neither the layout nor the request states a level."""
-    effects = {"buzz": Buzz(level=14), "click": Click(), "soft": Click(level=15)}
-    player = EffectPlayer(layout_of(left(on_press="buzz"), effects=effects))
-    player.intent([ON_LEFT], 0.0)
-    player.play(name, ON_LEFT, 0.0, level_db_sl=requested)
-    buzz, click = player.intent([ON_LEFT], 0.0).targets
-    assert (buzz.content, buzz.level_db_sl) == ("buzz", 14.0)
-    assert (click.content, click.level_db_sl, click.above_db) == (name, level, above)
-    assert player.intent([ON_LEFT], 0.2).targets == (buzz,)
 
 
 POSITIONS = st.tuples(st.floats(0, 0.2), st.floats(0, 0.2))

@@ -120,25 +120,6 @@ def test_loop_has_its_clicks_in_every_turn() -> None:
     assert [*files.clicks(0.0, 20.0)] == pytest.approx(times, abs=0.01)
 
 
-def rise_time(course: Any) -> int:
-    """How long a course takes at 0.5 s from silence to full strength [ms]."""
-    shares = course.at(np.arange(0.4, 0.6, 0.001))
-    return int(np.sum((shares > 0.01) & (shares < 0.99)))
-
-
-def test_finger_that_is_alone_feels_the_course_as_it_is() -> None:
-    """A step of intensity takes 5 ms, and 40 ms near another finger.
-
-    By hand: an average over 20 ms at half height is 40 ms wide.
-    """
-    step = Pattern(1.0, ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.9, 1.0)), ((0.0, 0.0),))
-    files = FilePlayer.of(it=file_of(step))
-    files.play(0.0)
-    assert rise_time(files.course(0.1)) <= 5
-    assert 25 <= rise_time(files.course(0.1, ANOTHER_FINGER)) <= 40
-    assert files.course(0.2).at(np.array([0.51]))[0] == 1.0
-
-
 def test_click_near_another_finger_has_a_wider_band() -> None:
     """58.5 and 80 Hz, moved by a third of an octave less 10 %."""
     files = FilePlayer.of(it=file_of())

@@ -78,20 +78,6 @@ def test_dial_ignores_radius_noise_and_its_center(way: list[Contact], clicks: li
     assert clicks_of_a_dial(way) == clicks
 
 
-def test_dial_turns_about_the_center_of_its_region() -> None:
-    """A quarter of a turn about that center is nine detents of 10 degrees."""
-    effects: dict[str, Effect] = {"dial": Dial(spacing=math.radians(10))}
-    player = EffectPlayer(SurfaceLayout((KNOB,), effects, elsewhere=None))
-    player.intent([at_angle(0)], 0.0)
-    starts = set()
-    for step in range(1, 91):
-        intent = player.intent([at_angle(step)], 0.1 * step)
-        for target in intent.targets:
-            assert target.pulse is not None
-            starts.add(target.pulse.requested_at)
-    assert len(starts) == 9
-
-
 def test_center_of_a_shape_is_that_of_its_area() -> None:
     """By hand: of a rectangle, and of an L of three unit squares, in either order of corners."""
     assert Rectangle(1.0, 2.0, 4.0, 2.0).center == (3.0, 3.0)
@@ -219,12 +205,6 @@ def test_level_above_the_maximum_is_a_problem(
         load_text(tmp_path, maximum + LOUD_EFFECTS)
     for key in problems:
         assert key in str(caught.value)
-
-
-def test_layout_can_raise_the_maximum_level(tmp_path: Path) -> None:
-    """Its loudest effect has 50 dB SL."""
-    layout = load_text(tmp_path, "max_level_db_sl: 50\n" + LOUD_EFFECTS)
-    assert layout.max_db_sl == 50
 
 
 REGION_KEYS = {

@@ -233,17 +233,6 @@ def call(gateway: GatewayProcess, method: str) -> tuple[int, dict[str, Any]]:
     return response.status, json.loads(response.body)
 
 
-@pytest.mark.parametrize("method", [name for name in PARAMETERS if name not in ("hello", "play")])
-def test_http_method_is_forwarded_to_the_daemon(
-    gateway: GatewayProcess, daemon: ScriptedDaemon, method: str
-) -> None:
-    """Once, and its result is returned as documented."""
-    status, result = call(gateway, method)
-    assert status == 200
-    METHODS[method].result.model_validate_json(json.dumps(result))
-    assert daemon.methods == [method]
-
-
 def test_http_error_has_the_code_and_data_of_the_api(
     gateway: GatewayProcess, daemon: ScriptedDaemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:

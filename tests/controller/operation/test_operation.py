@@ -126,33 +126,6 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
 
 
 @pytest.mark.parametrize("state", DaemonState)
-def test_step_leaves_comm_lost_alone_when_reconnected(state: DaemonState) -> None:
-    """For FAULT if anything is latched; in other states nothing changes."""
-    reconnection = DaemonEvent(Trigger.RECONNECTED)
-    for operation in operations(state):
-        updated, actions = step(operation, reconnection, ENERGISED_UNTIL)
-
-        if state is not DaemonState.COMM_LOST:
-            assert (updated, actions) == (operation, ())
-        elif operation.is_latched:
-            assert (updated.state, actions) == (DaemonState.FAULT, ())
-        else:
-            assert updated.state is DaemonState.SWITCH_ON_DISABLED
-            assert actions == (Action.VERIFY,)
-
-
-@pytest.mark.parametrize("state", DaemonState)
-def test_degraded_link_changes_no_state(state: DaemonState) -> None:
-    """While armed, its cause becomes that of the state."""
-    cause = "no reply" if state is DaemonState.OPERATION_ENABLED else "why"
-
-    change = DaemonEvent(Trigger.LINK_CHANGED, "no reply")
-    degraded, actions = step(Operation(state, "why"), change, 0.0)
-
-    assert (degraded.state, degraded.cause, actions) == (state, cause, ())
-
-
-@pytest.mark.parametrize("state", DaemonState)
 def test_unexpected_exception_is_latched(state: DaemonState) -> None:
     """It is a fault where amplifiers are open, and elsewhere one once they are."""
     updated = after_exception(Operation(state), "a bug")

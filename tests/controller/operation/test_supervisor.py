@@ -6,9 +6,8 @@ play are in test_what_may_play.py.
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine, Mapping
+from collections.abc import Mapping
 from itertools import product
-from typing import Any
 
 import pytest
 
@@ -49,19 +48,6 @@ ENABLED = DaemonState.OPERATION_ENABLED
 STOPPED = DaemonState.QUICK_STOP_ACTIVE
 FAULT = DaemonState.FAULT
 LOST = DaemonState.COMM_LOST
-
-
-@in_virtual_time
-async def test_amplifier_that_refuses_at_the_start_is_opened_again_later() -> None:
-    """The daemon serves meanwhile, as while no amplifier replies."""
-    async with supervised(is_refusing=True) as plate:
-        assert plate.state is LOST
-
-        plate.repair()
-        await asyncio.sleep(1)
-
-        assert plate.links == ["retry", "reopened"]
-        assert plate.state is READY
 
 
 @in_virtual_time
@@ -165,26 +151,6 @@ async def test_clear_is_refused_until_the_amplifier_reports_silence(
 
 
 @in_virtual_time
-async def test_clear_is_repeated_during_the_ramp_of_a_stop() -> None:
-    """An amplifier ignores Clear until it is silent, 50 ms later."""
-    async with supervised() as plate:
-        await plate.handle(ARM)
-        await plate.handle(STOP)
-        silent_at = threads.now() + 0.05
-        status = plate.far_end.status()
-
-        def ignore_clear(name: str, _: Values) -> Values | None:
-            is_ignored = name in ("Clear", "GetStatus") and threads.now() < silent_at
-            return status if is_ignored else None
-
-        plate.far_end.lie(ignore_clear)
-
-        await plate.handle(CLEAR)
-
-        assert plate.state is READY
-
-
-@in_virtual_time
 async def test_refused_clear_does_not_end_the_repetition_of_a_stop() -> None:
     """A level remains: the stop is repeated as long as it does, whoever clears meanwhile."""
     async with supervised() as plate:
@@ -220,23 +186,6 @@ async def test_stop_during_a_disarming_is_no_fault(pause: float) -> None:
         assert plate.state is STOPPED
         assert plate.far_end.state == "QUICK_STOP_ACTIVE"
         assert FAULT not in plate.states
-
-
-@in_virtual_time
-async def test_stop_while_arming_refuses_the_arming() -> None:
-    """It is no fault, and nothing was armed."""
-    async with supervised() as plate:
-        plate.far_end.delay(0.005)
-        arming = await plate.begin(ARM)
-        await asyncio.sleep(0.002)
-
-        await plate.handle(STOP)
-        with pytest.raises(CommandRefused):
-            await arming
-
-        assert plate.state is STOPPED
-        assert not plate.is_armed
-        assert ENABLED not in plate.states
 
 
 @in_virtual_time
@@ -328,35 +277,6 @@ async def test_touch_during_a_stall_is_played_after_it() -> None:
         assert plate.links == ["degraded", "restored"]
         assert (plate.state, plate.degraded) == (ENABLED, [])
         assert plate.is_loud
-
-
-@in_virtual_time
-async def test_cause_of_a_degraded_link_names_the_amplifiers_that_do_not_reply_now() -> None:
-    """The second fails 20 ms after the first, which replies again before its watchdog expires."""
-    async with supervised("a", "b") as plate:
-        operation = plate.supervisor.current
-        first, second = plate.far_ends
-        await plate.handle(ARM)
-        await asyncio.sleep(0.1)
-
-        first.fault("drop", toward="amplifier")
-        await asyncio.sleep(0.02)
-        second.fault("drop", toward="amplifier")
-        await asyncio.sleep(0.08)
-        assert (plate.state, plate.degraded) == (ENABLED, ["a"])
-        await asyncio.sleep(0.04)
-        assert plate.degraded == ["a", "b"]
-        assert "amplifier a, b does not reply" in operation.value.cause
-
-        first.recover()
-        await asyncio.sleep(0.04)
-        assert plate.degraded == ["b"]
-        assert "amplifier b does not reply" in operation.value.cause
-
-        second.recover()
-        await asyncio.sleep(0.1)
-        assert plate.state is ENABLED
-        assert plate.links == ["degraded", "degraded", "degraded", "restored"]
 
 
 @in_virtual_time
@@ -492,27 +412,6 @@ async def test_end_of_the_control_loop_ends_the_daemon() -> None:
 
     with pytest.raises(RuntimeError, match="control loop"):
         await cancel_loop()
-
-
-@in_virtual_time
-async def test_supervisor_ends_after_a_task_that_another_task_starts_at_the_end() -> None:
-    """Nothing that a task has begun is left behind when the supervisor has ended."""
-    ended = list[str]()
-
-    async def check() -> None:
-        await asyncio.sleep(0.1)
-        ended.append("check")
-
-    async with supervised() as plate:
-        spawn = plate.supervisor._spawn
-
-        async def stop() -> None:
-            await asyncio.sleep(1)
-            spawn(check())
-
-        spawn(stop())
-
-    assert ended == ["check"]
 
 
 @in_virtual_time
@@ -659,30 +558,6 @@ async def test_failing_transition_ends_in_a_stop(
         await arm_again(plate)
 
 
-@in_virtual_time
-async def test_failing_fault_reaction_stops_once() -> None:
-    """An exception in the reaction to a fault of a disarmed amplifier leads to one more stop.
-
-    The fault and the exception are in an epoch each.
-    """
-    async with supervised() as plate:
-        stop = plate.controller.stop
-
-        def fail_once() -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
-            plate.controller.stop = stop  # type: ignore[method-assign]
-            raise Planted("stop")
-
-        plate.controller.stop = fail_once  # type: ignore[method-assign]
-        first_epoch = plate.supervisor.operation.epoch
-
-        plate.answer("GetStatus", state="FAULT", fault="INTERNAL")
-        await asyncio.sleep(2)
-
-        assert plate.state is FAULT
-        assert plate.count("Stop") == 1
-        assert plate.supervisor.operation.epoch == first_epoch + 2
-
-
 def slow_down_stops(plate: SupervisedPlate, seconds: float) -> None:
     """Let stopping all amplifiers take so much longer."""
     stop_all = plate.controller.stop_all
@@ -800,25 +675,6 @@ async def test_second_clear_leaves_a_plate_alone_that_the_first_has_cleared() ->
 
         assert plate.state is ENABLED
         assert plate.far_end.state == "OPERATION_ENABLED"
-
-
-@in_virtual_time
-async def test_stop_in_progress_is_not_repeated(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """It is repeated only after its end, if the amplifier is still not silent."""
-    monkeypatch.setattr("controller.operation.supervisor.STATUS_INTERVAL", 0.02)
-    async with supervised() as plate:
-        plate.answer("Stop", "GetStatus", levels=[1000, 0, 0], state="QUICK_STOP_ACTIVE")
-
-        stopping = asyncio.ensure_future(plate.supervisor.stop("a test"))
-        await asyncio.sleep(0.1)
-        assert not stopping.done()
-        assert "stop repeated" not in caplog.text
-
-        await stopping
-        await asyncio.sleep(0.1)
-        assert "stop repeated" in caplog.text
 
 
 def reported_messages(plate: SupervisedPlate) -> dict[str, str]:

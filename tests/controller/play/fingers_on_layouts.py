@@ -1,7 +1,6 @@
 """Fingers on a layout in virtual time: real bytes on a wire, the paper's plate, what is felt."""
 
 import asyncio
-from collections import Counter
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -475,15 +474,6 @@ class Hands(Fingers):
                 for contact, _ in slot.content.targets:
                     positions.setdefault(contact.key.id, set()).add((contact.x, contact.y))
         return positions
-
-    @property
-    def most_of_a_stroke(self) -> float:
-        """The share of its stroke that all contents take of the ERA that is driven most."""
-        shares = Counter[str]()
-        for slot in self.applied[-1].contents.values():
-            for era, tone in slot.drive.items():
-                shares[era] += tone.level
-        return max(shares.values())
 
     def depths(self) -> dict[int, float]:
         """How deep the envelope at each finger beats 20 times a second; 1 is down to zero."""

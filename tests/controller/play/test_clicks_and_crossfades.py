@@ -105,19 +105,6 @@ async def test_click_is_6_db_above_the_buzz_of_its_finger_and_30_hz_from_all() -
 
 
 @in_virtual_time
-async def test_click_has_the_stroke_that_the_buzz_of_its_finger_leaves() -> None:
-    """It asks for more: one ERA is at full stroke then, and the continuous content stays."""
-    async with hands({1: LEFT}, layout="strong on the left", held=0.6) as fingers:
-        former = lasting_contents(fingers.applied[-1])
-        fingers.play("loud", 1)
-        await fingers.hold(0.02)
-        assert 0.97 <= fingers.most_of_a_stroke <= 1.0
-        assert lasting_contents(fingers.applied[-1]) == former
-        assert len(fingers.contents) == 2
-        assert fingers.refused == []
-
-
-@in_virtual_time
 async def test_continuous_content_has_the_stroke_that_a_loud_click_leaves_then_all() -> None:
     """It is raised amid the 40 ms of another finger's click: both need 1.2 strokes.
 
@@ -250,31 +237,6 @@ async def test_click_without_a_layer_is_reported_until_one_is_free() -> None:
         assert "4 simultaneous vibrations" in fingers.status("held_back")[3]
         await fingers.hold(0.06)
         assert fingers.held_back == {1: None, 3: None}
-
-
-@pytest.mark.long
-@in_virtual_time
-async def test_slide_to_another_band_keeps_the_beat() -> None:
-    """Carrier and side bands change their frequencies together, in one phase at the finger."""
-    async with hands({1: LEFT}, layout="modulated in two bands", held=0.5) as fingers:
-        await fingers.slide(0.64, 0.108, -0.032, 1)
-        await fingers.hold(1.0)
-        assert max(fingers.frequencies) < 200
-        assert 0.8 <= fingers.depths()[1] <= 1.3
-
-
-@in_virtual_time
-async def test_all_voices_of_a_finger_end_together() -> None:
-    """When it lifts, all its layers fall silent, and the other finger's is not touched."""
-    async with hands(TWO_FINGERS, layout="modulated", held=1.0) as fingers:
-        voices = dict.fromkeys(fingers.layers[1], False)
-        fingers.mark()
-        del fingers.at[1]
-        await fingers.hold(0.3)
-        assert len(voices) == 3
-        assert fingers.driven == voices
-        assert len(fingers.contents) == 1
-        assert fingers.is_loud
 
 
 @in_virtual_time

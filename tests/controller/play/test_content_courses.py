@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from controller.content.pattern import Pattern, Transient
-from controller.daemon.plate_view import PlateView
 from controller.effects.file_effect import File
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
@@ -28,7 +27,7 @@ from model.answer.envelope import Course
 from model.vibration import Tone
 from registry import threads
 from tests.controller.play.driven_loop import DrivenLoop
-from tests.controller.play.fingers_on_layouts import ABOVE, LAYOUT, LEFT, RIGHT, fingers_on
+from tests.controller.play.fingers_on_layouts import LEFT, fingers_on
 
 FULL_LEVEL = 0.2
 """Level of the table's pattern."""
@@ -137,17 +136,6 @@ async def feeling(
     async with chain as loop:
         loop.feels = feels
         yield loop
-
-
-@in_virtual_time
-async def test_course_is_played_as_it_is() -> None:
-    """It is sent in pieces that follow each other, and it ends by itself."""
-    async with feeling(WAVE) as loop:
-        looks = await loop.look_at(1.4, FINGER)
-        loop.must_follow(looks)
-        pieces = [vibration.layer.after for vibration in loop.vibrations]
-        assert pieces == [False, True, True, True, True]
-        assert loop.refused == []
 
 
 @in_virtual_time
@@ -321,23 +309,3 @@ async def test_click_of_a_file_is_felt_in_a_gap_of_its_continuous_event() -> Non
         expected = {0.20: 1.0, 0.26: 1.0, 0.29: 1 / 3, 0.31: 0.0, 0.33: 0.0, 0.35: 1 / 3, 0.4: 1.0}
         played = np.interp([*expected], times - times[0] + 0.01, levels / levels.max())
         np.testing.assert_allclose(played, [*expected.values()], atol=0.01)
-
-
-@in_virtual_time
-async def test_status_states_contents_by_finger_and_drives_by_layer() -> None:
-    """It uses the keys of the API."""
-    positions = {1: LEFT, 2: RIGHT, 3: ABOVE}
-    async with fingers_on(paper_table(), LAYOUT, at=positions, held=0.5) as fingers:
-        report = fingers.applied[-1]
-        event = PlateView(lambda key: "buzz", report.contacts, report).pattern_event()
-    assert len(event.layers) == 3
-    for contact, (number, slot) in zip(event.contacts, report.contents.items(), strict=True):
-        assert (contact.role, contact.held_back) == ("target", None)
-        promise = contact.promised_contrast_db
-        assert contact.verdict == ("own" if promise >= 12 else "mixed")
-        assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)
-        assert contact.foreign_level_db_sl == pytest.approx(14.0 - promise, abs=2.0)
-        assert contact.rig_foreign_level_db_sl == contact.foreign_level_db_sl  # of one set
-        assert contact.frequency_hz == slot.content.frequency
-        tones = event.layers[str(number)].values()
-        assert {tone.frequency_hz for tone in tones} == {contact.frequency_hz}

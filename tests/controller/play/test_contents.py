@@ -199,20 +199,6 @@ def test_content_that_is_lowered_too_far_is_held_back() -> None:
     assert held_back.held_back
 
 
-def test_contents_that_a_limit_makes_imperceptible_are_held_back() -> None:
-    """It is 40 dB lower than 14 dB SL requires; a level below 0 dB SL from the start is kept."""
-    targets = Target(FIRST, 14.0), Target(SECOND, 14.0)
-    level = 0.01 * total_levels(choose(FREE, *targets)).max()
-
-    limited = choose(within(level=level), *targets)
-    assert limited.contents == ()
-    for unserved in limited.unserved:
-        assert "the limits of the amplifiers" in (unserved.held_back or "")
-
-    quiet = choose(FREE, *(replace(target, level_db_sl=-10.0) for target in targets))
-    assert len(quiet.contents) == 2
-
-
 @pytest.mark.parametrize("limit", ["level", "power"])
 def test_louder_content_of_equal_priority_is_lowered(limit: str) -> None:
     """Max-min: the softer content keeps its level as long as the louder one is above it."""
@@ -263,23 +249,6 @@ def test_content_for_which_a_click_leaves_nothing_has_a_reason_and_plays_after_i
     later = selector.select(CONTACTS, HapticIntent((lasting,)), capabilities, now=selector.due)
     assert later.unserved == ()
     assert len(later.contents) == 1
-
-
-@pytest.mark.parametrize("limit", ["level", "power"])
-def test_single_content_is_lowered_to_a_limit(limit: str) -> None:
-    """It plays with 0.8 of its amplitude instead of being refused by the amplifiers."""
-    target = Target(FIRST, 14.0)
-    free = select(FREE, target)
-    capabilities = limit_to_80_percent(free, limit)
-
-    limited = select(capabilities, target)
-
-    np.testing.assert_allclose(total_levels(limited), 0.8 * total_levels(free), rtol=1e-6)
-    (former,), (lowered,) = free.finger_sensations, limited.finger_sensations
-    level = former.level_db_sl + 20 * np.log10(0.8)
-    assert lowered.level_db_sl == pytest.approx(level)
-    promise = former.sensation.promised_contrast_db
-    assert lowered.sensation.promised_contrast_db == pytest.approx(promise)
 
 
 @in_virtual_time

@@ -64,19 +64,6 @@ async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
 
 
 @in_virtual_time
-async def test_latency_counts_from_the_touch_though_its_first_set_is_lost() -> None:
-    """There is no reply for 80 ms from the moment at which the finger comes.
-
-    Its set is sent three times, and each reply is awaited for 30 ms; then the status is read and
-    the touch is planned again.
-    """
-    async with set_running(of=DrivenLoop) as loop:
-        loop.far_end.fault("drop", toward="host", lasts=0.08)
-        await loop.hold(0.3, down=[FINGER])
-        assert loop.latencies == [pytest.approx(0.0925, abs=0.0025)]
-
-
-@in_virtual_time
 async def test_latency_counts_to_the_start_with_several_amplifiers() -> None:
     """The frame is 3 ms old; the reply to the stage takes 10 ms, the commits 3.5 to 5 ms.
 
@@ -469,25 +456,3 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
         await loop.leave(60.0, FINGER)
         assert not loop.far_end.sent()[-1].is_silent
         assert 0.0 < max(loop.expiries) - began < 2.1
-
-
-@in_virtual_time
-async def test_vibration_of_a_finger_that_moves_whenever_the_loop_turns_is_renewed() -> None:
-    """Half a millimeter changes nothing else, and there is no gap."""
-    async with set_running(of=DrivenLoop) as loop:
-        number, x, y = FINGER
-        step = loop.controller.cycle.step
-        position = x
-
-        async def move_and_step() -> None:
-            nonlocal position
-            await asyncio.sleep(0.002)
-            position = x if position != x else x + 0.0005
-            loop.put((number, position, y))
-            await step()
-
-        loop.controller.cycle.step = move_and_step  # type: ignore[method-assign]
-        await asyncio.sleep(6.0)
-        assert len(loop.vibrations) > 3
-        assert loop.gaps == []
-        assert loop.far_end.levels[0] == 0.2  # of the table's pattern

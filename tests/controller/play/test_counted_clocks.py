@@ -117,14 +117,6 @@ def test_losses_of_a_clock_are_logged_once_with_their_count(
         assert "amplifier b" in message
 
 
-def test_clock_that_is_not_known_yet_causes_no_warning(caplog: pytest.LogCaptureFixture) -> None:
-    """Its line has just been opened."""
-    clocks = CountedClocks(ALTERNATING_RIG, lambda: {"a": 4e-6, "b": math.inf})
-    caplog.set_level(logging.INFO, logger=LOGGER)
-    assert clocks.counted_by(smooth_table()).clocks.groups == BOTH_AMPLIFIERS
-    assert [record.levelno for record in caplog.records] == [logging.INFO]
-
-
 def halves() -> Rig:
     """The paper's rig after identification, with each half of it on an amplifier."""
     channels = [Channel("a", 0), Channel("a", 1), Channel("b", 0), Channel("b", 1)]

@@ -208,15 +208,6 @@ async def test_content_plays_near_a_protected_finger_only_below_its_threshold(
             assert level < promised[3]
 
 
-@in_virtual_time
-async def test_protected_finger_feels_its_own_effect() -> None:
-    """The content of the other finger is held back for it, whatever their priorities."""
-    layout = "above is protected and feels something"
-    async with hands({1: LEFT, 3: ABOVE}, layout=layout, held=1.0) as fingers:
-        assert fingers.status("verdict") == {1: "held back", 3: "own"}
-        assert fingers.levels_db_sl()[3] > 12
-
-
 @pytest.mark.parametrize(
     ("layout", "verdicts"),
     [
@@ -313,20 +304,6 @@ async def test_resting_fingers_are_served_once_the_ledger_admits_them() -> None:
         fingers.restore()
         await fingers.hold(1.2)
         assert fingers.held_back == {1: None, 2: None}
-
-
-@in_virtual_time
-async def test_resting_finger_feels_again_what_an_amplifier_refused_once() -> None:
-    """All channels are silent for a second."""
-    async with hands() as fingers:
-        await fingers.hold(0.1)
-        fingers.must_be_felt = False
-        fingers.refuse_next_set()
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.9)
-        assert (len(fingers.refused), len(fingers.applied)) == (1, 0)
-        await fingers.hold(0.5)
-        assert len(fingers.applied) == 1
 
 
 @in_virtual_time

@@ -160,20 +160,6 @@ async def test_arm_changes_nothing_while_armed() -> None:
 
 
 @in_virtual_time
-async def test_arm_begins_a_new_session_on_all_when_one_was_disarmed() -> None:
-    """After another program has disarmed one amplifier, no session continues."""
-    async with set_running("a", "b", of=DrivenLoop) as loop:
-        former_sessions = {far_end.amplifier.session for far_end in loop.far_ends}
-        loop.far_ends[0].obey("Disarm", {"ramp": 0}, threads.now())
-
-        await loop.controller.arm()
-
-        assert loop.amplifier_states == ["OPERATION_ENABLED"] * 2
-        sessions = {far_end.amplifier.session for far_end in loop.far_ends}
-        assert sessions & former_sessions == set()
-
-
-@in_virtual_time
 async def test_touch_as_arming_ends_is_felt(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its set may be on the wire when the amplifiers are armed and active layers are forgotten."""
     async with set_running(of=DrivenLoop) as loop:
@@ -203,19 +189,6 @@ async def test_open_names_the_amplifier_that_cannot_be_reached(fault: dict[str, 
         with pytest.raises(LinkError) as caught:
             await loop.controller.open()
         assert [*caught.value.lost] == ["b"]
-
-
-@in_virtual_time
-async def test_open_names_all_amplifiers_of_a_line_that_cannot_be_opened() -> None:
-    """Two amplifiers share the line, as on a CAN bus; the third has its own."""
-    async with set_running("a", "b", "c", of=DrivenLoop) as loop:
-        await loop.controller.disarm()
-        await loop.controller.release()
-        loop.far_ends[1].fault("unplug")
-        loop.controller.urls["c"] = f"{loop.controller.urls['b']}&address=2"
-        with pytest.raises(LinkError) as caught:
-            await loop.controller.open()
-        assert [*caught.value.lost] == ["b", "c"]
 
 
 @in_virtual_time

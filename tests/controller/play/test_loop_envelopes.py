@@ -84,15 +84,6 @@ def has_onset(loop: DrivenLoop) -> list[bool]:
 
 
 @in_virtual_time
-async def test_open_prepares_table_and_envelopes() -> None:
-    """The drive mode and the frequencies are prepared when the controller is opened."""
-    timing = Shapes()
-    async with set_running(of=DrivenLoop, timing=timing, knots=32) as loop:
-        assert loop.table.prepared == ["phased"]
-        assert timing.prepared == [90, 110, 150, 250]
-
-
-@in_virtual_time
 async def test_touch_starts_along_its_onset() -> None:
     """No touch waits for an ending, and the last knot is the level of the command.
 

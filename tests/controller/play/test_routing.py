@@ -183,14 +183,6 @@ def test_route_by_hand() -> None:
     }
 
 
-def test_route_leaves_values_beyond_the_limits_to_the_ledger() -> None:
-    """400 of 200 µm and a phase that is not a number arrive unchanged."""
-    layers = route({"B": Tone(1e9, 4e-4, math.nan)}, PAIRED_RIG, ramp=0)
-    tone = layers["left"].tones[1]
-    assert (tone.frequency, tone.level) == (1e9, pytest.approx(2.0))
-    assert math.isnan(tone.phase)
-
-
 def test_route_refuses_a_pattern_of_another_rig_as_a_whole() -> None:
     """The error names the ERA that the rig does not have."""
     drive = {"A": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}

@@ -1,6 +1,5 @@
 """A selector asks a table for an intent, and again when it must; what each finger then feels."""
 
-import asyncio
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,12 +12,11 @@ import pytest
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.selected_contents import Selection, beside_others, judged, sums_db, weakened
+from controller.play.selected_contents import Selection, beside_others, judged, sums_db
 from controller.play.selection import Selector
 from controller.play.shared_capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from kit.clock import in_virtual_time
-from kit.fingers import playable
 from kit.fingers import table as paper_table
 from kit.set_table import set_answer
 from model.answer.answer import Answer, Limits, Sensation
@@ -27,7 +25,6 @@ from model.errors import InputError
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.vibration import Excitation, Tone
-from registry.limits import HAND_LOAD
 from tests.controller.play.fingers_on_layouts import LAYOUT, LEFT, RIGHT, fingers_on
 
 CAPABILITIES = PlaybackCapabilities(
@@ -131,58 +128,6 @@ FELT_BY_FIRST = wanting(target(1))
 FELT_BY_SECOND = wanting(target(2))
 
 
-@pytest.mark.parametrize("contacts", [(), (FIRST,), (contact_at(1, 0.29),)])
-@pytest.mark.parametrize("intent", [wanting(), wanting(target(9))])
-def test_selector_asks_nothing_without_a_target_on_the_plate(
-    contacts: Sequence[Contact], intent: HapticIntent
-) -> None:
-    """The reason for silence is that of the intent."""
-    dialogue = SelectorDialogue()
-    choice = dialogue.select(intent, *contacts)
-    assert dialogue.table.questions == []
-    assert choice.contents == ()
-    assert choice.reason == "nothing is wanted"
-
-
-@pytest.mark.parametrize("mover", [FIRST, SECOND], ids=["quiet contact", "target"])
-def test_selector_asks_again_when_a_contact_has_moved_by_8_mm(mover: Contact) -> None:
-    """The distance counts from where the pattern was selected."""
-    dialogue = SelectorDialogue()
-
-    def contacts(distance: float) -> list[Contact]:
-        moved = replace(mover, y=mover.y + distance)
-        return [moved if contact is mover else contact for contact in (FIRST, SECOND)]
-
-    dialogue.must_ask(FELT_BY_SECOND, *contacts(0.0))
-    dialogue.must_keep(FELT_BY_SECOND, *contacts(0.004))
-    dialogue.must_keep(FELT_BY_SECOND, *contacts(0.0079))
-    dialogue.must_ask(FELT_BY_SECOND, *contacts(0.0081))
-    dialogue.must_ask(FELT_BY_SECOND, *contacts(0.0))
-
-
-def test_selector_asks_again_for_another_load() -> None:
-    """A question states the load of the target first."""
-    dialogue = SelectorDialogue()
-    heavier_first = replace(FIRST, load=1.6)
-    heavier_second = replace(SECOND, load=2.4)
-
-    dialogue.must_ask(FELT_BY_SECOND, FIRST, SECOND)
-    question = dialogue.must_ask(FELT_BY_SECOND, heavier_first, SECOND)
-    assert [finger.load for finger in question] == [1.0, 1.6]
-    dialogue.must_keep(FELT_BY_SECOND, heavier_first, SECOND)
-    question = dialogue.must_ask(FELT_BY_SECOND, heavier_first, heavier_second)
-    assert [finger.load for finger in question] == [2.4, 1.6]
-
-
-def test_selector_keeps_a_short_pulse_for_another_load() -> None:
-    """The pulse is over before a change would help."""
-    dialogue = SelectorDialogue()
-    pulse = Pulse(0.04, requested_at=0.0, is_raised=False)
-    intent = HapticIntent((target(1, pulse=pulse),))
-    dialogue.must_ask(intent, FIRST)
-    dialogue.must_keep(intent, replace(FIRST, load=2.0))
-
-
 def test_selector_asks_again_for_another_level_at_the_active_frequency_first() -> None:
     """Another target is asked for in the whole band."""
     dialogue = SelectorDialogue()
@@ -206,15 +151,6 @@ def test_selector_keeps_its_choice_when_a_quiet_contact_lifts() -> None:
     dialogue.must_keep(FELT_BY_SECOND, SECOND)
 
 
-def test_selector_asks_again_when_a_hand_lifts() -> None:
-    """Without its load the plate responds differently."""
-    dialogue = SelectorDialogue()
-    question = dialogue.must_ask(FELT_BY_SECOND, replace(FIRST, load=HAND_LOAD), SECOND)
-    assert [finger.load for finger in question] == [1.0, HAND_LOAD]
-    question = dialogue.must_ask(FELT_BY_SECOND, SECOND)
-    assert [finger.load for finger in question] == [1.0]
-
-
 def test_selector_asks_again_after_a_refusal_when_contacts_change() -> None:
     """Without the quiet finger it might be possible; the reason for silence is the table's."""
     dialogue = SelectorDialogue()
@@ -231,35 +167,9 @@ def test_selector_asks_again_after_a_refusal_when_contacts_change() -> None:
     assert len(dialogue.choices[-1].contents) == 1
 
 
-def test_selector_is_silent_after_an_error_of_the_table_until_contacts_change() -> None:
-    """The exception is the reason for silence."""
-    dialogue = SelectorDialogue()
-    dialogue.table.error = ZeroDivisionError("by no ERA")
-    dialogue.must_ask(FELT_BY_FIRST, FIRST)
-    assert dialogue.choices[-1].reason == "ZeroDivisionError: by no ERA"
-    dialogue.must_keep(FELT_BY_FIRST, FIRST)
-
-    dialogue.table.error = None
-    dialogue.must_ask(FELT_BY_FIRST, contact_at(1, 0.2))
-    assert len(dialogue.choices[-1].contents) == 1
-
-
 def with_stroke(stroke: float) -> PlaybackCapabilities:
     """Amplifiers with two layers and a stroke of the only ERA [m]."""
     return replace(CAPABILITIES, limits=Limits((45.0, 300.0), {"SW": stroke}), layers=2)
-
-
-def test_pulse_is_held_back_when_others_use_the_whole_stroke() -> None:
-    """Of 1 µm the other finger takes 1 µm: this is reported instead of playing level zero."""
-    dialogue = SelectorDialogue()
-    pulse = target(2, 12.0, Pulse(0.03, requested_at=0.0))
-    intent = HapticIntent((target(1, 12.0), pulse))
-
-    selection = dialogue.selector.select((FIRST, SECOND), intent, with_stroke(1e-6))
-
-    assert [content.contact.key.id for content in selection.contents] == [1]
-    (unserved,) = selection.unserved
-    assert "use the whole stroke" in (unserved.held_back or "")
 
 
 @pytest.mark.parametrize(("since", "amplitude"), [(0.0, 0.6e-6), (0.02, 0.6e-6), (0.5, 1e-6)])
@@ -329,16 +239,6 @@ def test_powers_of_other_contents_add(
     assert together.verdict == verdict
 
 
-def test_crosstalk_level_is_the_greatest_and_that_by_the_rigs_thresholds() -> None:
-    """5 dB SL by the rig's set, 33 by another; weakened by 6 dB, each is 6 dB less."""
-    together = beside_others(sensation(), [5.0, 33.0], [5.0, 33.0], [0.0, 28.0])
-    weaker = weakened(together, -6.0, -6.0)
-    levels = [
-        (level.rig_foreign_level_db_sl, level.foreign_level_db_sl) for level in (together, weaker)
-    ]
-    assert levels == [(5.0, 33.0), (-1.0, 27.0)]
-
-
 def power(level_db: float | None) -> float:
     """The power of a level [dB], of 0 dB without one."""
     return float(10 ** ((level_db or 0.0) / 10))
@@ -370,24 +270,3 @@ async def test_click_changes_the_report_for_its_neighbor_only_meanwhile() -> Non
     contrast = meanwhile.sensation.promised_contrast_db
     assert contrast == pytest.approx(10 * math.log10(level / noise), abs=1e-6)
     assert meanwhile.sensation.verdict == ("own" if contrast >= 12 else "mixed")
-
-
-@in_virtual_time
-async def test_click_without_a_free_layer_is_refused_and_the_buzz_continues() -> None:
-    """Both layers are in use, and the row of its finger states the reason."""
-    contacts = [contact_at(0, *LEFT), contact_at(1, *RIGHT)]
-    lasting = tuple(Target(contact.key, 14.0, content="buzz") for contact in contacts)
-    click = Target(contacts[0].key, 20.0, Pulse(0.04, 1.0), content="click", priority=9)
-    selector = Selector(Chooser(paper_table()))
-
-    selections = []
-    for targets in (lasting, lasting, (*lasting, click)):
-        intent = HapticIntent(targets)
-        selections.append(selector.select(contacts, intent, playable(2), now=1.0))
-        await asyncio.sleep(0.1)  # lets the thread choose
-
-    _, former, clicked = selections
-    assert clicked.contents == former.contents
-    finger_sensation = clicked.finger_sensations[0]
-    assert replace(finger_sensation, held_back=None) == former.finger_sensations[0]
-    assert "no layer is free" in (finger_sensation.held_back or "")

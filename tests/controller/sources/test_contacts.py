@@ -3,7 +3,6 @@
 What a source rejects is counted.
 """
 
-import logging
 import math
 from collections import Counter
 from collections.abc import Iterable
@@ -20,7 +19,6 @@ from controller.sources.touch import (
     Change,
     Contact,
     ContactKey,
-    RejectCounter,
     Touch,
     TouchFrame,
     Track,
@@ -108,22 +106,6 @@ def test_turned_sensor_maps_its_upper_corners(
     assert (right.x, right.y) == pytest.approx(top_right)
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "position"),
-    [
-        (0.0, 0.0, (0.0, 0.2)),  # top left of the sensor: north-west
-        (0.0, 1.0, (0.0, 0.0)),  # bottom left: south-west, the plate's origin
-        (0.25, 0.75, (0.075, 0.05)),
-    ],
-)
-def test_tracker_maps_touches_to_the_plate(
-    tracker: TouchedTracker, x: float, y: float, position: tuple[float, float]
-) -> None:
-    """Touch y runs down from the top left corner, plate y up from the south-west one."""
-    (contact,) = tracker.touch(0.0, Touch(1, x, y)).down
-    assert (contact.x, contact.y) == pytest.approx(position)
-
-
 def test_contact_is_reported_once_down_once_moved_and_once_up(tracker: TouchedTracker) -> None:
     """It keeps the time of its first frame."""
     landed = tracker.touch(1.0, FINGER)
@@ -180,13 +162,6 @@ def test_finger_along_the_rim_is_at_the_edge_of_the_plate(tracker: TouchedTracke
     assert (keys(off.up), off.rejected) == ([KEY], ("off_plate",))
 
 
-def test_last_touch_of_an_id_in_a_frame_counts(tracker: TouchedTracker) -> None:
-    """The repetition is reported."""
-    change = tracker.touch(0.0, Touch(1, 0.1, 0.5), Touch(1, 0.9, 0.5))
-    assert (keys(change.down), change.rejected) == ([KEY], ("twice",))
-    assert tracker.touch(0.1, Touch(1, 0.9, 0.5)).moved == ()
-
-
 def test_contact_beyond_twenty_waits_for_a_lift(tracker: TouchedTracker) -> None:
     """The twenty that came first stay, whatever their order in frames."""
     change = tracker.touch(0.0, *fingers(21))
@@ -195,32 +170,6 @@ def test_contact_beyond_twenty_waits_for_a_lift(tracker: TouchedTracker) -> None
     assert keys(tracker.contacts) == [("a", id) for id in range(20)]
     tracker.touch(0.02, *fingers(20, first=1))
     assert keys(tracker.contacts) == [("a", id) for id in range(1, 21)]
-
-
-def test_ten_contacts_are_fingers_in_order_of_arrival(tracker: TouchedTracker) -> None:
-    """The others are surplus until a finger lifts or becomes a hand, which is no finger."""
-    tracker.touch(0.0, *fingers(12))
-    tracker.touch(0.0, *fingers(2), source="b")
-    assert surplus(tracker) == [10, 11, 0, 1]
-
-    lifted = tracker.touch(0.02, *fingers(11, first=1))
-    assert surplus(tracker) == [11, 0, 1]
-    assert [contact.key.id for contact in lifted.pressed] == [10]
-
-    hand = Touch(1, 0.5, 0.5, HAND_LOAD)
-    pressed = tracker.touch(0.04, hand, *fingers(10, first=2)).pressed
-    assert surplus(tracker) == [0, 1]
-    assert [contact.key.id for contact in pressed] == [1, 11]
-
-
-def test_surplus_contact_becomes_a_finger_when_a_source_times_out(tracker: TouchedTracker) -> None:
-    """This is a change of pressure."""
-    tracker.touch(0.0, *fingers(10))
-    tracker.touch(0.1, *fingers(1), source="b")
-    assert surplus(tracker) == [0]
-    change = tracker.expire(0.16)
-    assert surplus(tracker) == []
-    assert keys(change.pressed) == [("b", 0)]
 
 
 def test_origin_that_has_all_contacts_gives_way_to_another(tracker: TouchedTracker) -> None:
@@ -242,13 +191,6 @@ def test_origin_that_has_all_contacts_gives_way_to_another(tracker: TouchedTrack
     tracker.touch(0.0, *fingers(2), source="tuio:b")
     touch_greedily()
     assert shares(tracker) == {"tuio:a": 18, "tuio:b": 2}
-
-
-def test_sources_of_one_origin_have_equal_shares(tracker: TouchedTracker) -> None:
-    """Of two browsers behind one gateway, the one with twenty fingers leaves ten to the other."""
-    tracker.touch(0.0, *fingers(20), source="api:1", origin="api")
-    tracker.touch(0.0, *fingers(19), source="api:2", origin="api")
-    assert shares(tracker) == {"api:1": 10, "api:2": 10}
 
 
 @pytest.mark.parametrize(("origin", "share"), [("one", 5), (None, 0)])
@@ -335,30 +277,6 @@ def test_finger_after_a_tap_is_a_new_contact(tracker: TouchedTracker) -> None:
     assert (keys(change.down), keys(change.up)) == ([KEY], [KEY])
     tracker.touch(2.02, keeps_taps=True)
     assert tracker.contacts == ()
-
-
-def test_touch_off_the_plate_is_no_tap(tracker: TouchedTracker) -> None:
-    """The contact lifts immediately."""
-    tracker.touch(1.0, FINGER)
-    tracker.touch(1.0, Touch(1, 1.5, 0.5), keeps_taps=True)
-    assert tracker.contacts == ()
-
-
-def test_tap_ends_when_its_source_times_out(tracker: TouchedTracker) -> None:
-    """Its last frame states 20 ms."""
-    tracker.touch(2.0, FINGER)
-    tracker.touch(2.0, timeout=0.02, keeps_taps=True)
-    tracker.expire(2.021)
-    assert tracker.contacts == ()
-
-
-def test_tap_gives_way_to_a_finger_of_another_source(tracker: TouchedTracker) -> None:
-    """All contacts are taps of one source."""
-    tracker.touch(3.0, *fingers(MAX_CONTACTS))
-    tracker.touch(3.0, keeps_taps=True)
-    assert shares(tracker) == {"a": MAX_CONTACTS}
-    tracker.touch(3.0, FINGER, source="b", keeps_taps=True)
-    assert shares(tracker) == {"a": MAX_CONTACTS - 1, "b": 1}
 
 
 @pytest.mark.parametrize(
@@ -523,21 +441,3 @@ def test_hand_stays_a_hand_until_it_is_lifted(
     assert contact.is_hand
     assert contact.load == load
     assert not contact.is_under_way
-
-
-def test_reject_counter_logs_once_per_second(caplog: pytest.LogCaptureFixture) -> None:
-    """A thousand bad datagrams make one line; a new reason makes a line immediately."""
-    now = 0.0
-    rejects = RejectCounter(logging.getLogger("bad input"), clock=lambda: now)
-    for _ in range(1000):
-        rejects.count("malformed", "ends too early")
-    assert rejects.counts == {"malformed": 1000}
-    assert len(caplog.records) == 1
-    rejects.count("late", "frame\x1b[2J 3")
-    assert len(caplog.records) == 2
-    assert "new=1000" in caplog.messages[1]
-    assert "late 1, malformed 1000" in caplog.messages[1]
-    assert "\x1b" not in rejects.examples["late"]
-    now = 1.0
-    rejects.count("late", "frame 4")
-    assert len(caplog.records) == 3

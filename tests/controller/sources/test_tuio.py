@@ -148,15 +148,6 @@ def test_sender_that_counts_from_one_again_has_restarted(
     assert reader.rejects == {}
 
 
-def test_senders_are_kept_apart_by_name_and_address(reader: Reader) -> None:
-    """They may use the same ids and numbers."""
-    reader.read(0.0, at(LEFT, fseq=100, source="a"))
-    reader.read(0.0, at(MIDDLE, fseq=100, source="b"))
-    reader.must_read(0.0, at({}, fseq=100, source="a"), {}, ANOTHER_PEER)
-    reader.must_read(0.0, alive(1, fseq=101, source="a"), LEFT)
-    reader.must_read(0.0, alive(1, fseq=101, source="b"), MIDDLE)
-
-
 def test_seventeenth_sender_is_refused_until_another_has_been_quiet(reader: Reader) -> None:
     """It is counted once."""
     for number in range(16):
@@ -193,12 +184,6 @@ def test_other_profiles_and_protocols_are_counted(reader: Reader) -> None:
         "profile_tuio2": 1,
         "other_address": 1,
     }
-
-
-def test_cursors_without_an_alive_message_are_alive(reader: Reader) -> None:
-    """Only those that the bundle sets."""
-    reader.read(0.0, bundle(TABLE, cursor(1, 0.5, 0.5), cursor(2, 0.75, 0.5)))
-    reader.must_read(0.0, bundle(TABLE, cursor(2, 0.25, 0.5)), {2: (0.25, 0.5)})
 
 
 def test_blobs_have_sizes_and_negative_ids(reader: Reader) -> None:
@@ -240,27 +225,6 @@ def test_blobs_near_several_cursors_belong_to_the_nearest(reader: Reader) -> Non
     left_blob = blobs(blob(3, 0.5, 0.5, TIP), ids=(3,))
     number = 1 + (1 << 32)
     reader.must_read(0.01, left_blob, {**RIGHT, number: (0.5, 0.5, *TIP)})
-
-
-def test_profiles_are_numbered_apart(reader: Reader) -> None:
-    """A late bundle of blobs changes nothing, and their restart leaves the cursors."""
-    palm = blob(7, 0.25, 0.5, PALM)
-    reader.read(0.0, at(MIDDLE, fseq=500))
-    reader.read(0.0, blobs(palm, ids=(7,), fseq=500))
-    reader.must_read(0.01, blobs(fseq=499), None)
-    reader.must_read(0.01, alive(1, fseq=501), {**MIDDLE, -8: (0.25, 0.5, *PALM)})
-    reader.must_read(0.02, blobs(fseq=1), MIDDLE)
-
-
-def test_blob_is_not_confirmed_by_cursors_nor_by_its_number(reader: Reader) -> None:
-    """A number that comes back is another blob; the last bundle of a blob may have been lost."""
-    reader.read(0.0, blobs(blob(7, 0.5, 0.5, TIP), ids=(7,)))
-    reader.read(0.01, blobs())
-    reader.must_read(0.02, bundle(TABLE, message("alive", 7, address=BLOB)), {})
-    palm = {-8: (0.25, 0.5, *PALM)}
-    reader.must_read(0.03, blobs(blob(7, 0.25, 0.5, PALM), ids=(7,)), palm)
-    reader.must_read(3.02, at(MIDDLE), {**palm, **MIDDLE})
-    reader.must_read(3.04, alive(1, fseq=1), MIDDLE)
 
 
 def test_bundle_has_as_many_messages_as_ten_times_as_many_contacts_need(reader: Reader) -> None:

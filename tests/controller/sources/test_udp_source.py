@@ -101,26 +101,6 @@ async def test_oversized_datagram_is_cut_to_one_byte_more() -> None:
     assert [len(data) for data, _ in received] == [100, 101]
 
 
-async def test_receiver_can_close_within_its_callback() -> None:
-    """Datagrams that arrived after that one are not delivered."""
-    received: list[bytes] = []
-    closed = asyncio.Event()
-
-    def feed(data: bytes, peer: Peer, arrived: float) -> None:
-        received.append(data)
-        line.close()
-        closed.set()
-
-    line = await listen("127.0.0.1", 0, feed, max_size=100)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for datagram in (b"1", b"2"):
-            sender.sendto(datagram, ("127.0.0.1", line.port))
-    async with asyncio.timeout(TIME_LIMIT):
-        await closed.wait()
-    await asyncio.sleep(0)
-    assert received == [b"1"]
-
-
 async def test_superseded_bundles_of_a_flood_are_dropped() -> None:
     """Of 200 frames that arrived while the loop was busy, a few and the newest are delivered."""
     received: list[bytes] = []

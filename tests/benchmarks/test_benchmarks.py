@@ -1,6 +1,5 @@
 """Every benchmark starts; the data set of the contrast benchmark, its entries and its scores."""
 
-import hashlib
 import json
 import re
 import runpy
@@ -10,22 +9,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from benchmarks.contrast.__main__ import (
     CHECKSUM,
     FILE,
-    VERSION,
     SetScore,
     app,
-    data_set,
     read_entry,
     score,
     summary,
 )
-from model.arrays import least_gap
 from model.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -71,25 +66,6 @@ def scores_of(path: Path, **options: bool) -> dict[str, SetScore]:
     """The scores of an entry by set."""
     _, patterns = read_entry(path)
     return score(patterns, **options)
-
-
-def test_data_set_has_the_checksum_of_its_version() -> None:
-    """A change of its bytes is a new version."""
-    assert f"-{VERSION}." in FILE.name
-    assert hashlib.sha256(FILE.read_bytes()).hexdigest() == CHECKSUM
-
-
-def test_fingers_of_the_data_set_are_apart_and_off_the_edges() -> None:
-    """At least 5 cm apart and 13 mm from edges; ten sets each with one, two and three quiet."""
-    for plate in data_set().plates.values():
-        counts = [contact_set.quiet_count for contact_set in plate.sets]
-        assert counts == [1] * 10 + [2] * 10 + [3] * 10
-        size = np.array([plate.rig.plate.length, plate.rig.plate.width])
-        for contact_set in plate.sets:
-            positions = np.array(contact_set.contacts)
-            distances = np.minimum(positions, size - positions)
-            assert distances.min() >= 0.0129, contact_set
-            assert least_gap(positions) >= 0.0499, contact_set
 
 
 def test_contrast_is_a_ratio_and_level_an_amplitude(tmp_path: Path) -> None:
@@ -162,14 +138,6 @@ def test_score_prints_data_set_and_rows(tmp_path: Path) -> None:
 
     assert report["checksum"] == CHECKSUM
     assert [row["plate"] for row in report["rows"]] == ["paper_plate"] * 3
-
-
-def test_export_writes_the_data_set_and_its_rigs(tmp_path: Path) -> None:
-    """One file of the data set and one rig per plate."""
-    run("export", "-o", tmp_path / "data")
-
-    names = {path.name for path in (tmp_path / "data").iterdir()}
-    assert names == {FILE.name, *(f"{name}.yaml" for name in data_set().plates)}
 
 
 @pytest.mark.parametrize("method", ["contrast-control", "pressure-matching"])

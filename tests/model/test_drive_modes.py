@@ -195,31 +195,6 @@ def test_highest_switched_level_includes_two_tones() -> None:
     assert HIGHEST_LEVELS["switched"](forms) == pytest.approx(np.sqrt(2), rel=1e-4)
 
 
-def test_highest_phased_level_is_the_sum_of_the_magnitudes() -> None:
-    """No weights up to full stroke give more."""
-    forms = random_forms(2)
-
-    sums = np.abs(forms.targets[0]).sum(axis=1) / forms.threshold
-    assert HIGHEST_LEVELS["phased"](forms) == pytest.approx(sums.max(), rel=1e-4)
-
-
-def test_single_era_is_switched_at_its_best_frequency() -> None:
-    """By hand: contrasts of 2, 4, 3 and of 8 below the level; the highest level is 5."""
-    target = np.array([2, 4, 3, 0.8], dtype=np.complex64).reshape(1, 4, 1)
-    quiet = np.array([1, 1, 1, 0.01], dtype=np.complex64).reshape(4, 1, 1, 1)
-    thresholds = np.array([1, 1, 0.6, 1], dtype=np.float32)
-    power = (target * target)[..., None]
-    forms = Forms(target, power, quiet, thresholds, wanted=1.5, level_margin=0.0)
-
-    drives = switched_patterns.find_switched(forms)
-
-    assert [score for score, _ in drives] == pytest.approx([4, 3, 2])
-    tones = [tone for _, drive in drives for tone in drive]
-    assert [row for row, _ in tones] == [1, 2, 0]
-    assert [weights.tolist() for _, weights in tones] == [[1]] * 3
-    assert HIGHEST_LEVELS["switched"](forms) == pytest.approx(5.0)
-
-
 @pytest.mark.parametrize(
     ("level_step", "phase_step", "richest"),
     [

@@ -17,7 +17,7 @@ import pytest
 import model.compiled
 from build_libraries import Library, compile_library, kernel_library
 from model import caching, processes
-from model.arrays import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
+from model.arrays import NEARLY, best_along, best_first, best_of
 from model.caching import NUMERICS_VERSION, code_version
 from model.compiled import kernels as compiled_kernels
 from model.compiled.kernels import kernels, processor_features, why_slow
@@ -142,18 +142,6 @@ def test_cluster_yields_every_result(address: str) -> None:
     assert results == {0: (17, 0), 1: (8, 1), 2: (5, 2), 3: (4, 1)}
 
 
-def process_number(shared: None, task: int) -> int:
-    """Return the number of the process."""
-    return os.getpid()
-
-
-def test_cluster_solves_tasks_in_other_processes(address: str) -> None:
-    """Not in this one."""
-    numbers = dict(on_cluster(address, process_number, None, {0: 0, 1: 1}))
-
-    assert os.getpid() not in numbers.values()
-
-
 def allow_failures(count: int, dask_scheduler: Any) -> None:
     """Set how many workers a task may cost, on the scheduler."""
     dask_scheduler.allowed_failures = count
@@ -242,36 +230,6 @@ def test_first_of_nearly_equal_best_scores_is_chosen(scores: list[float]) -> Non
 def test_nearly_equal_scores_keep_their_order(scores: list[float], order: list[int]) -> None:
     """The best come first."""
     expect_always(best_first, scores, order)
-
-
-def test_best_rows_are_in_the_order_of_their_first_scores() -> None:
-    """Row and column of three of ten scores."""
-    scores = [[2.0, -4.0], [7.0, -1.0], [2.0, -1.0], [0.0, -9.0], [7.0, -4.0]]
-
-    expect_always(lambda rounded: best_rows(rounded, 3).T, scores, [[1, 4, 0], [1, 2, 0]])
-
-
-def test_items_are_ranked_by_nearly_equal_scores() -> None:
-    """By their order."""
-    items = "abcde"
-    scores = [2.0, 1.0, 2.0, 3.0, 3.0]
-
-    def best(rounded: np.ndarray) -> str:
-        return best_by(items, lambda item: rounded[items.index(item)])
-
-    def ranked(rounded: np.ndarray) -> str:
-        return "".join(ranked_by(items, lambda item: rounded[items.index(item)]))
-
-    expect_always(best, scores, "d")
-    expect_always(ranked, scores, "deacb")
-
-
-def test_score_that_is_better_by_more_than_rounding_is_chosen() -> None:
-    """However little more."""
-    scores = [1.0, 1 + 3 * NEARLY]
-
-    expect_always(best_of, scores, 1)
-    expect_always(best_first, scores, [1, 0])
 
 
 # Kernels

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import dblquad
 
 from cases import shortly
 from error_estimates import CASES, MAX_RATIO, judge
@@ -21,7 +20,6 @@ from model.finger import (
     FIVE_POINTS,
     THRESHOLDS,
     DiscRule,
-    Grid,
     check_has_threshold,
     detection_threshold,
     felt_part,
@@ -30,13 +28,10 @@ from model.finger import (
 )
 from model.rig.rig import Rig
 from model.rig.rig_mesh import mesh_of
-from model.structure.material import Material
-from model.structure.plate import Plate
 from model.vibration import (
     Excitation,
     Tone,
     default_frequencies,
-    find_nulls,
     meshes_to_compare,
     peak_acceleration,
     plate_map,
@@ -190,18 +185,6 @@ def test_plate_map_refuses_invalid_excitations(
         plate_map(coarse_rig, excitation)
 
 
-def test_find_nulls_returns_each_null_once() -> None:
-    """Two points at rest on a map that is not square: x by the column, y by the row."""
-    x = np.linspace(0, 3, 16)
-    y = np.linspace(0, 2, 11)
-    nulls = np.array([[0.4, 1.8], [2.2, 0.6]])
-    distances = [np.hypot(x - column, y[:, None] - row) for column, row in nulls]
-
-    points = find_nulls(x, y, np.min(distances, axis=0))
-
-    np.testing.assert_allclose(points[::-1], nulls)
-
-
 # Fingertips
 
 
@@ -224,50 +207,6 @@ def test_rules_integrate_polynomials_up_to_their_degree(rule: DiscRule, degree: 
 
     mean = rule.weights @ x ** (degree + 1)
     assert abs(mean - disc_mean(degree + 1, 0)) > 1e-3
-
-
-@pytest.mark.parametrize("rule", [FIVE_POINTS, FINE_POINTS], ids=["5", "21"])
-@pytest.mark.parametrize(
-    "limits", [(0, -2, 2, 2), (0, 0, 2, 2), (-2, -2, 0.3, 0.8), (-0.31, -2, 2, 2)]
-)
-def test_cut_discs_keep_the_mean_of_linear_functions(
-    rule: DiscRule, limits: tuple[float, ...]
-) -> None:
-    """At an edge and at corners the mean of a linear function is that over the remaining area.
-
-    limits: of x and y, lowest and highest, of a disc of radius 1.
-    """
-    low_x, low_y, high_x, high_y = limits
-
-    low, high = np.array([[low_x, low_y]]), np.array([[high_x, high_y]])
-    (points,), (weights,) = rule.cut(low, high)
-
-    def bottom(x: float) -> float:
-        return max(low_y, -math.sqrt(1 - x * x))
-
-    def top(x: float) -> float:
-        return min(high_y, math.sqrt(1 - x * x))
-
-    left = max(low_x, -1)
-    right = min(high_x, 1)
-    integrals = []
-    for function in (lambda y, x: 1.0, lambda y, x: x, lambda y, x: y):
-        integral, _ = dblquad(function, left, right, bottom, top, epsabs=1e-7)
-        integrals.append(integral)
-    centroid = np.array(integrals[1:]) / integrals[0]
-    assert weights.min() >= 0
-    assert weights.sum() == pytest.approx(1)
-    np.testing.assert_allclose(weights @ points, centroid, atol=1e-5)
-
-
-def test_grid_numbers_cells_along_x_first() -> None:
-    """Three by two cells of 100 mm."""
-    plate = Plate(0.3, 0.2, 0.0015, Material("any", E=70e9, rho=2700.0, nu=0.33))
-
-    centers = Grid(3, 2).centers(plate)
-
-    np.testing.assert_allclose(centers[:3], [[0.05, 0.05], [0.15, 0.05], [0.25, 0.05]])
-    np.testing.assert_allclose(centers[3:], [[0.05, 0.15], [0.15, 0.15], [0.25, 0.15]])
 
 
 # Thresholds
@@ -304,12 +243,6 @@ def test_pressing_fingertips_are_more_sensitive() -> None:
     assert abs(low) < 5
     assert min(pacinian) >= 20
     assert max(pacinian) <= 35
-
-
-def test_unknown_set_of_thresholds_is_refused() -> None:
-    """By the names of the known sets."""
-    with pytest.raises(InputError, match=PRESSING):
-        detection_threshold(np.array([100.0]), "thumb")
 
 
 def test_sensation_level_adds_tones_as_powers() -> None:
@@ -370,11 +303,3 @@ def test_felt_part_passes_tones_up_to_a_kilohertz(
     inner = slice(round(0.003 * rate), round(0.097 * rate))
     np.testing.assert_allclose(first[inner], gain * tone[inner], atol=0.01)
     np.testing.assert_allclose(second, -2 * first, atol=1e-12)
-
-
-def test_felt_part_of_few_samples_is_the_same() -> None:
-    """At 2 kHz they have nothing above 1 kHz; an empty signal remains empty."""
-    samples = np.random.default_rng(0).normal(size=(200, 2))
-
-    np.testing.assert_array_equal(felt_part(samples, 2000.0), samples)
-    assert felt_part(samples[:0], 10_000.0).shape == (0, 2)

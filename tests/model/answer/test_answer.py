@@ -1,6 +1,5 @@
 """Answers: several contents at once, fingers that give way, and modulation, by exact plates."""
 
-import json
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,6 @@ import pytest
 from kit.plates import SMALL_TABLE_HZ, contact_sets, realised, smooth_rig, smooth_table
 from kit.set_table import drives, only, phased, wants
 from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
-from model.answer.answer_report import query_one
 from model.answer.plan import answer, prepare_answers
 from model.answer.promise import felt_amplitudes, loudest_power
 from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
@@ -215,19 +213,6 @@ def test_frequencies_are_within_their_bands(is_swapped: bool) -> None:
         assert low <= frequency <= high
 
 
-def test_frequencies_are_apart_if_their_bands_allow_it() -> None:
-    """Otherwise the answer reports two contents that are near."""
-    fingers = [wants(place) for place in (NEAR, FAR, THIRD)]
-    banded = [wants(NEAR, (90, 95)), wants(FAR, (90, 95))]
-
-    apart = phased(smooth_table(), fingers, apart_hz=60, min_contrast_db=-99)
-    near = phased(smooth_table(), banded)
-
-    frequencies = sorted(layer.frequency for layer in apart.layers)
-    assert np.diff(frequencies).min() >= 60
-    assert "closer than 30 Hz" in near.applied[0]
-
-
 @pytest.mark.parametrize("duration", [None, 0.04])
 def test_frequency_that_plays_is_avoided(duration: float | None) -> None:
     """By 30 Hz: as on a table without the nearer ones. If the band leaves no choice, it is used.
@@ -277,22 +262,6 @@ def test_equal_levels_lose_the_same() -> None:
     assert max(shares_of_stroke(by_priority, table).values()) <= 1 + 1e-6
 
 
-def test_louder_content_does_not_starve_a_softer_one() -> None:
-    """It is lowered first: the softer keeps its level as long as it is the softer."""
-    table = smooth_table()
-    fingers = [wants(NEAR, level_db_sl=60), wants(FAR, level_db_sl=12)]
-
-    served = phased(table, fingers, min_contrast_db=-99)
-
-    loud, soft = promised_levels(served)
-    assert soft == pytest.approx(12, abs=1e-3)
-    assert 12 < loud < 59.5
-    (change,) = served.applied
-    assert f"{loud:.1f} dB SL" in change
-    assert served.stroke_factor == pytest.approx(10 ** ((loud - 60) / 20), rel=1e-3)
-    assert max(shares_of_stroke(served, table).values()) == pytest.approx(1.0, abs=1e-5)
-
-
 def test_twenty_fingers_take_little_memory(without_kernels: Callable[[], None]) -> None:
     """In numpy, whose arrays are counted: less than a table, though the level is out of reach."""
     without_kernels()
@@ -309,17 +278,6 @@ def test_twenty_fingers_take_little_memory(without_kernels: Callable[[], None]) 
 
 
 # Fingers that share or are held back
-
-
-def test_two_near_fingers_share_one_content() -> None:
-    """No other finger has to be quiet, so they need no contrast."""
-    fingers = [wants(place, may_share=True) for place in ((0.16, 0.06), (0.19, 0.06))]
-
-    served = phased(smooth_table(), fingers)
-
-    assert "shares" in served.applied[-1]
-    assert min(promised_levels(served)) > 19.9
-    assert {sensation.promised_contrast_db for sensation in served.fingers} == {None}
 
 
 def test_nearest_two_of_the_fingers_that_may_share_do() -> None:
@@ -382,15 +340,6 @@ def test_finger_that_must_not_be_disturbed_is_not(margin: float, verdict: str) -
     assert served.fingers[1].foreign_level_db_sl <= bound
 
 
-def test_bound_of_a_finger_with_a_content_holds_back_another() -> None:
-    """Even one of a higher priority."""
-    bounded = wants(NEAR, priority=-1, max_foreign_db_sl=-30.0)
-
-    served = phased(smooth_table(), [bounded, wants(FAR)])
-
-    assert verdicts_of(served) == ["own", "held back"]
-
-
 def test_lowest_priority_is_held_back() -> None:
     """Its finger has the contrast that it would have had, and the level of the others there."""
     higher = [wants(place, priority=1) for place in (NEAR, THIRD, FOURTH)]
@@ -419,40 +368,6 @@ def test_remaining_content_keeps_its_band() -> None:
     assert served.fingers[1].verdict == "held back"
     for name, tone in drives(served)[0].items():
         assert 470 <= tone.frequency <= 500, name
-
-
-def test_content_is_held_back_for_a_stroke_that_is_used_up() -> None:
-    """By a higher priority; its figures are null in JSON, which has no infinity."""
-    loud = {"at": NEAR, "level_db_sl": 60.0, "priority": 1}
-    soft = {"at": FAR, "level_db_sl": 12.0}
-
-    reply = query_one(smooth_table(), {"own": [loud, soft], "mode": "phased"})
-
-    assert reply["fingers"][1]["verdict"] == "held back"
-    json.dumps(reply, allow_nan=False)
-
-
-def test_contrast_out_of_reach_is_reported() -> None:
-    """A single content plays though it misses the contrast."""
-    served = phased(smooth_table(), [wants(NEAR)], [Finger(QUIET)], min_contrast_db=99)
-
-    assert served.promised_worst_db < 99
-    (change,) = served.applied
-    assert "99" in change
-
-
-def test_unprotected_finger_gives_way_to_more_contrast() -> None:
-    """The others have more than if the finger is kept quiet."""
-    fingers = [wants(NEAR, priority=1), wants(FAR, priority=1)]
-    third = wants(THIRD)
-    unprotected = replace(third, is_protected=False)
-
-    alone = phased(smooth_table(), [*fingers, unprotected], min_contrast_db=9.0)
-    with_quiet = phased(smooth_table(), [*fingers, third], min_contrast_db=9.0)
-
-    assert alone.fingers[2].verdict == "held back"
-    assert with_quiet.fingers[2].verdict == "held back"
-    assert alone.promised_worst_db > with_quiet.promised_worst_db + 1
 
 
 # Side bands
@@ -588,20 +503,6 @@ def test_fingers_that_share_or_are_held_back_feel_side_bands(
     levels = realised(table, served, plates).foreign[finger]
     assert 0.82 <= np.mean(levels <= crosstalk) <= 0.97
     assert [layer.side_bands for layer in bounded.layers] == [()] * len(bounded.layers)
-
-
-@pytest.mark.parametrize("modulation", [15.0, 25.0])
-def test_modulation_between_two_frequencies_plays_the_nearest(
-    table: LocalizationTable, modulation: float
-) -> None:
-    """At steps of 10 Hz 15 are 10 or 20 and 25 are 20 or 30, the same on both sides."""
-    finger = wants(FIRST, (150.0, 200.0), modulation_hz=modulation)
-
-    layer, _ = phased(table, [finger, wants(SECOND, (290.0, 320.0))]).layers
-
-    low, high = side_frequencies(layer)
-    assert layer.frequency - low == pytest.approx(high - layer.frequency)
-    assert abs(high - layer.frequency - modulation) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize(("limits", "count"), [(NO_LIMITS, 2), (Limits((100.0, 300.0)), 0)])

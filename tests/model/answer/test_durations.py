@@ -9,13 +9,11 @@ import pytest
 from benchmarks.promise.clicks import clicks_on
 from benchmarks.promise.clicks import given as contrasts_on_drawn_plates
 from kit.plates import contact_sets, small_table, smooth_rig, smooth_table
-from model.answer.answer import Limits
 from model.answer.envelope import (
     COURSE_KNOT_STEP,
     Course,
     DriveEnvelope,
     pulse_ramp,
-    shaped_gain,
 )
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer, query
@@ -88,15 +86,6 @@ def test_strongest_moments_of_a_course_are_40_ms(name: str) -> None:
     assert course.strongest_db == pytest.approx(10 * math.log10(mean_square), abs=0.03)
 
 
-def test_decaying_course_is_predicted_as_it_is_played() -> None:
-    """Knots 10 ms apart are at 0.5 and 0, and playback rises from silence to the first."""
-    predicted = DriveEnvelope.of_course(Course((0.0, 0.02), (1.0, 0.0)))
-
-    assert predicted.step == 0.0025
-    in_steps_of_5_ms = predicted.values[:12:2]
-    assert in_steps_of_5_ms == pytest.approx([0, 0.25, 0.5, 0.25, 0, 0], abs=1e-5)
-
-
 @pytest.mark.parametrize("modulation", [20.0, 2.0])
 def test_sinusoidal_modulation_has_three_tones(modulation: float) -> None:
     """Beats that come and go along a raised cosine of 8 s.
@@ -122,15 +111,6 @@ def test_sinusoidal_modulation_has_three_tones(modulation: float) -> None:
         expected = np.where(offsets == 0, 1.0, 0.0)
         expected[np.abs(offsets) == modulation] = (played / 2) ** 2
         np.testing.assert_allclose(shares / shares.max(), expected, atol=0.01)
-
-
-def test_shaped_gain_is_that_of_a_raised_cosine() -> None:
-    """By quadrature: the mean square of ((1 - cos) / 2)^2 over 40 ms, then 1 up to the end."""
-    times = (np.arange(100_000) + 0.5) / 100_000 * 0.2
-    amplitude = (1 - np.cos(np.pi * np.minimum(times / 0.04, 1))) / 2
-
-    expected = math.sqrt((amplitude**2).mean())
-    assert shaped_gain(0.2) == pytest.approx(expected, rel=1e-5)
 
 
 # Predictions and the plate in time
@@ -312,21 +292,6 @@ def test_level_of_a_click_is_felt_over_its_duration() -> None:
     steady = felt_level(amplitudes[0]) / detection_threshold(frequencies)[0]
     assert click.fingers[0].level_db_sl == pytest.approx(20.0, abs=1e-3)
     assert in_db(gain * steady) == pytest.approx(20.0, abs=0.02)
-
-
-def test_ramp_is_as_long_as_the_rise_of_levels_allows() -> None:
-    """An ERA that rises by 3 per second takes longer than the ramp of 10 ms, and is raised."""
-    table = small_table()
-    finger = Finger(TARGET, Stimulus(40.0, duration=0.04))
-
-    free = answer(table, [finger], drive_mode="phased")
-    slow = answer(table, [finger], drive_mode="phased", limits=Limits(slew=3.0))
-
-    levels = [free.amplitudes[name] / table.full_levels[name] for name in free.amplitudes]
-    assert slow.layers[0].ramp == pytest.approx(max(levels) / 3.0)
-    assert slow.layers[0].ramp > 0.02
-    assert slow.fingers[0].level_db_sl == pytest.approx(40.0, abs=0.1)
-    assert max(slow.amplitudes.values()) > max(free.amplitudes.values())
 
 
 def test_quiet_fingers_limit_the_raise_of_a_click() -> None:

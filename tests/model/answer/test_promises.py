@@ -32,7 +32,6 @@ from model.answer.answer import (
     Answer,
     Limits,
     Sensation,
-    verdict_of,
 )
 from model.answer.plan import answer
 from model.answer.stimulus import BY_NAME, MUST, NEVER, Finger, Stimulus
@@ -381,27 +380,6 @@ def table_by(*sets: str) -> LocalizationTable:
     return build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
 
 
-@pytest.mark.usefixtures("kernels_or_numpy")
-def test_single_content_has_the_best_frequency_by_all_sets() -> None:
-    """Within half a decibel of the best of all frequencies one by one.
-
-    It is not 50 Hz, whose second harmonic is felt by pressing fingertips: of a tone, the harmonic
-    alone depends on the set.
-    """
-    table = table_by(*THRESHOLDS)
-    target = (0.08, 0.06)
-    quiet = [Finger((0.16, 0.06))]
-
-    contrast = phased(table, [wants(target)], quiet).promised_worst_db
-
-    contrasts = {}
-    for frequency in table.frequencies.tolist():
-        banded = phased(table, [wants(target, (frequency, frequency))], quiet)
-        contrasts[frequency] = banded.promised_worst_db
-    assert contrast > max(contrasts.values()) - 0.5
-    assert contrast > contrasts[50.0] + 6
-
-
 def test_levels_and_bounds_are_above_the_rigs_own_thresholds() -> None:
     """A second set changes neither the level nor, for a content alone, the contrast.
 
@@ -428,20 +406,3 @@ def test_levels_and_bounds_are_above_the_rigs_own_thresholds() -> None:
     within_bound = phased(table_by(*THRESHOLDS), fingers, [bounded])
     assert within_bound.fingers[0].verdict == OWN
     assert within_bound.fingers[1].foreign_level_db_sl > crosstalk + 20
-
-
-@pytest.mark.parametrize(
-    ("contrast", "crosstalk", "pauses", "verdict"),
-    [
-        (12.0, 5.0, False, OWN),
-        (11.9, -5.0, False, MIXED),
-        (12.0, 5.0, True, MIXED),
-        (12.0, 0.0, True, OWN),
-        (None, None, True, OWN),
-    ],
-)
-def test_content_is_own_from_12_db_on(
-    contrast: float | None, crosstalk: float | None, pauses: bool, verdict: str
-) -> None:
-    """A content that pauses is own only if no other is felt: 0 dB SL of crosstalk at most."""
-    assert verdict_of(contrast, crosstalk, pauses=pauses) == verdict

@@ -1,7 +1,6 @@
 """Fingers and stimuli, and the search for tones: the kernel in C against numpy."""
 
 import math
-import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,7 +14,6 @@ from cases import read_yaml, shortly
 from kit.plates import SMALL_TABLE_HZ, contact_sets, smooth_rig, smooth_table
 from kit.set_table import only, phased, wants
 from model.answer import plan, tone_search
-from model.answer.envelope import Course
 from model.answer.plan import query
 from model.answer.promise import share_stroke
 from model.answer.question import Contents, Stream
@@ -172,17 +170,6 @@ def test_search_of_the_best_frequencies_loses_little(monkeypatch: pytest.MonkeyP
     assert np.mean(losses) < 0.1
 
 
-def test_prepared_table_goes_to_another_process() -> None:
-    """Its answers are the same there."""
-    table = table_with_mass()
-    placed = Placement((PLACES[0],), (PLACES[1],))
-    layer, _ = only(table, placed)
-
-    received = pickle.loads(pickle.dumps(table))
-
-    assert only(received, placed)[0].excitation == layer.excitation
-
-
 def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:
     """By hand: two contents, a quiet finger and an unprotected finger, on eleven plates.
 
@@ -220,24 +207,6 @@ def test_higher_priority_has_its_stroke_first() -> None:
     assert factor == pytest.approx(0.45)
 
 
-@pytest.mark.parametrize(
-    ("needs", "expected"),
-    [((0.8, 0.4, 0.3), (0.375, 1, 1)), ((0.8, 0.8, 0.3), (0.175, 0.7, 1))],
-    ids=["one", "two"],
-)
-def test_loudest_contents_are_lowered_first(needs: list[float], expected: list[float]) -> None:
-    """By hand: levels of 8, 2 and 1, which need these shares of an ERA.
-
-    The first is lowered, or the first two end at the level 1.4: 0.14 + 0.56 + 0.3.
-    """
-    weights = np.array(needs, dtype=np.complex64)[:, None]
-
-    gains, factor = share_stroke(np.ones(3), weights, np.array([8.0, 2.0, 1.0]), [0, 0, 0])
-
-    assert gains == pytest.approx(expected)
-    assert factor == pytest.approx(min(expected))
-
-
 # Rejected questions
 
 REJECTED = read_yaml(FOLDER / "rejected.yaml")
@@ -253,13 +222,6 @@ def test_placement_is_rejected(name: str) -> None:
         check_fingers(together(placed, Stimulus()), smooth_table().plate)
 
 
-def test_two_targets_may_be_near_each_other() -> None:
-    """Fingers with one stimulus can be 5 mm apart."""
-    placed = Placement((TARGET, (0.095, 0.07)), (QUIET,))
-
-    check_fingers(together(placed, Stimulus()), smooth_table().plate)
-
-
 @pytest.mark.parametrize("name", REJECTED["stimuli"])
 def test_stimulus_is_rejected(name: str) -> None:
     """The error names the argument."""
@@ -270,20 +232,6 @@ def test_stimulus_is_rejected(name: str) -> None:
         Stimulus(**arguments)
 
 
-@pytest.mark.parametrize("duration", ["0.5", 0.2])
-def test_stimulus_with_a_course_has_no_other_duration(duration: object) -> None:
-    """The course has one."""
-    with pytest.raises(InputError, match="duration"):
-        Stimulus(duration=duration, course=Course((0, 0.5), (1, 1)))
-
-
-@pytest.mark.parametrize("argument", ["level_db_sl", "duration"])
-def test_stimulus_rejects_an_integer_beyond_all_floats(argument: str) -> None:
-    """No OverflowError."""
-    with pytest.raises(InputError, match=argument):
-        Stimulus(**{argument: 10**400})
-
-
 @pytest.mark.parametrize("name", REJECTED["fingers"])
 def test_finger_is_rejected(name: str) -> None:
     """The error names the argument."""
@@ -292,13 +240,6 @@ def test_finger_is_rejected(name: str) -> None:
 
     with pytest.raises(InputError, match=argument):
         phased(smooth_table(), [Finger(TARGET, Stimulus(), **arguments)])
-
-
-@pytest.mark.parametrize("position", [np.array(0.1), np.ones((2, 2)), (0.1, "0.1"), {1, 2}])
-def test_finger_rejects_a_position(position: object) -> None:
-    """A position is two numbers."""
-    with pytest.raises(InputError, match="two numbers"):
-        Finger(position)
 
 
 @pytest.mark.parametrize("keys", [{"duration": 0.04}, {"is_limit": True}], ids=str)
@@ -342,16 +283,6 @@ def test_query_rejects_a_drive_mode() -> None:
     """Modes have names."""
     with pytest.raises(InputError, match="drive mode"):
         query(smooth_table(), Placement((TARGET,)), drive_mode="loud")
-
-
-@pytest.mark.parametrize("sequence", [list, np.array])
-def test_sequences_of_two_numbers_become_tuples(sequence: type) -> None:
-    """A finger has the same value and hash however its position and band are written."""
-    finger = Finger((0.1, 0.2), Stimulus(band_hz=(40.0, 120.0)))
-
-    equal = Finger(sequence([0.1, 0.2]), Stimulus(band_hz=sequence([40, 120])))
-
-    assert {finger, equal} == {finger}
 
 
 # Levels
@@ -407,23 +338,6 @@ def test_limit_is_as_strong_as_a_quiet_finger_allows(mode: str) -> None:
     for answer in (quiet, alone):
         lowered = 26.0 - answer.fingers[0].promised_level_db_sl
         assert answer.fingers[0].lowered_db == pytest.approx(lowered, abs=1e-3)
-
-
-def test_limit_is_not_lowered_for_another_content() -> None:
-    """The other vibration does not count; without quiet fingers both have their levels."""
-    neighbor = Finger((0.05, 0.17), Stimulus(20.0))
-
-    answer = phased(smooth_table(), [LIMIT, neighbor])
-
-    verdicts = {sensation.verdict for sensation in answer.fingers}
-    assert verdicts <= {"own", "mixed"}
-    assert answer.fingers[0].promised_level_db_sl >= 12.0 - 1e-3
-
-    alone = phased(smooth_table(), [LIMIT], [NEAR_TARGET, neighbor.at])
-    joint = phased(smooth_table(), [LIMIT, neighbor], [NEAR_TARGET], min_contrast_db=-99.0)
-    assert joint.fingers[2].foreign_level_db_sl > -10.0
-    level_alone = alone.fingers[0].promised_level_db_sl
-    assert joint.fingers[0].promised_level_db_sl > level_alone - 3.0
 
 
 def test_two_targets_share_a_vibration_of_their_level() -> None:

@@ -9,7 +9,6 @@ import os
 import re
 import shlex
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -71,15 +70,6 @@ def show_lines(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return era("table", "show", path, "--weak").stdout.splitlines()
 
 
-def test_show_prints_a_summary(show_lines: list[str]) -> None:
-    """Dead zones, feasible cells, contrast, mesh and fingerprint."""
-    rows = {line[:20].strip(): line[20:].strip() for line in show_lines}
-
-    assert rows["dead zones"].startswith("0 %")
-    for name in ("feasible cells", "contrast to 3 others", "mesh", "fingerprint"):
-        assert rows[name], name
-
-
 def test_show_prints_a_map(show_lines: list[str]) -> None:
     """The map is 4 by 3, with errors of its values, and each of its stars is in the list."""
     (start,) = [
@@ -123,26 +113,6 @@ def test_commands_warn_if_there_are_no_kernels(
 
 
 # Plates
-
-
-def map_at(level: float) -> dict[str, Any]:
-    """Return the map of two ERAs, the second at half the level of the first."""
-    options = ("--mesh", "24x18", "--points", "13x10")
-    drives = ("--drive", f"SW=110@{level}", "--drive", f"NE=110@{level / 2}:90")
-    return as_json("plate", "map", RIG, *options, *drives)
-
-
-def test_map_is_proportional_to_the_level() -> None:
-    """A raster row per y, its maximum named; half the level is half."""
-    full = map_at(1)
-    half = map_at(0.5)
-
-    peak = np.array(full["peak_acceleration_m_s2"])
-    assert peak.shape == (10, 13)
-    x, y = full["max_at_m"]
-    row, column = full["y_m"].index(y), full["x_m"].index(x)
-    assert full["max_m_s2"] == peak.max() == peak[row, column]
-    np.testing.assert_allclose(half["peak_acceleration_m_s2"], peak / 2, rtol=1e-12)
 
 
 @pytest.mark.long
@@ -208,16 +178,6 @@ def test_next_line_is_quoted_for_the_shell(
         printed = next_line("era", "table", "show", "my $plates/t.npz", "--weak")
 
     assert printed == line
-
-
-def test_next_line_has_the_path_of_era_if_the_shell_does_not_find_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Typed as `.venv/bin/era` in a shell without the environment, the next command works too."""
-    monkeypatch.setattr(sys, "argv", [".venv/bin/era", "demo"])
-    monkeypatch.setenv("PATH", "")
-
-    assert next_line("era", "status") == "Next: .venv/bin/era status"
 
 
 # Cases

@@ -144,29 +144,6 @@ def test_harmonics_at_fingers_are_those_of_drawn_phases(row: int) -> None:
         )
 
 
-def test_harmonics_beyond_the_thresholds_are_not_felt() -> None:
-    """Thresholds end at 1 kHz, so twice 520 Hz has none."""
-    fingers = FingersOnPlate.of(table_with_harmonics(), PLACES, LOADS)
-
-    powers = fingers.harmonics(SEVERAL_THOUSAND, np.array([4]), WEIGHTS[[4]])
-
-    np.testing.assert_array_equal(powers, 0)
-
-
-def test_search_counts_harmonics_over_the_plate() -> None:
-    """Mean square of the second ERA's at twice the frequency by the direct solver."""
-    table = table_with_harmonics()
-
-    power = table.search_error_power[2, 1] - table.error_power[2, 1]
-
-    frequency = FREQUENCIES[2]
-    fields = solved_directly(table, 2 * frequency, table.raster.points)
-    factor = SHARE * detection_threshold(frequency) / detection_threshold(2 * frequency)
-    mean_square = np.mean(np.abs(fields[1]) ** 2)
-    expected = factor**2 * mean_square
-    assert power == pytest.approx(expected, rel=0.02)
-
-
 # Clocks
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
@@ -233,34 +210,6 @@ def random_weights(rows: int) -> Complex64Array:
 def quadratic_form(forms: Complex64Array, weights: Complex64Array) -> FloatArray:
     """Return w^H R w (f, q) of forms (f, q, n, n) and weights (f, n)."""
     return np.einsum("fi,fqij,fj->fq", weights.conj(), forms, weights).real
-
-
-@pytest.mark.usefixtures("kernels_or_numpy")
-def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
-    """w^H R w of random weights is the mean over 4000 plates, relative to the mean amplitude's.
-
-    The latter is smaller by exp(-p² / 2), p = 2 pi f times 0.2 ms; there are no other deviations.
-    """
-    table = identified_table()
-    exact = np.zeros_like(table.discretization_error)
-    table = replace(table, uncertainty=Uncertainty.none(), discretization_error=exact)
-    table = table.with_clocks(clocks(a=2e-4, b=2e-4))
-    fingers = FingersOnPlate.of(table, PLACES, ())
-    tips = fingers.tips
-    rows = np.array([3, 12, 25])
-    weights = random_weights(3)
-    drawing = Drawing(4000, 5, 1)
-
-    forms = fingers.touched.forms(rows, tips.fine, tips.fine_weights, table.error_power)
-
-    drawn = fingers.powers(drawing, rows, weights)[..., 1:]
-    powers = drawn.mean(axis=-1)
-    squares = (powers * tips.fine_weights).sum(axis=-1)
-    thresholds = table.thresholds[rows, None]
-    phases = 2 * math.pi * table.frequencies[rows] * 2e-4
-    shrinking = np.exp(-(phases**2))
-    expected = quadratic_form(forms.power, weights) * shrinking[:, None]
-    np.testing.assert_allclose(expected, squares * thresholds**2, rtol=0.06)
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")
@@ -548,39 +497,6 @@ def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(
     low = direct_fields(lower, with_exciter=rig is MIXED)
     exact = np.einsum("e,fep->fp", DRIVE, high - low) / 2e-3
     assert largest_error(change, exact) < 0.01
-
-
-@pytest.mark.usefixtures("kernels_or_numpy")
-@pytest.mark.parametrize("modulus", [0.0, 0.04])
-def test_thickness_is_exact_at_its_nodes(modulus: float) -> None:
-    """The direct solve of plates so much thicker, far from proportional changes.
-
-    With a modulus that moves frequencies as much as the thickness, the plate has half of each.
-    """
-    touched = Touched.by(Uncertainty(thickness=0.02), modulus=modulus)
-    plate = touched.plate
-    weights = np.tile(DRIVE, (4, 1))
-    first = plate.plate_on_eras.first[5]
-
-    fields = []
-    for node in (MODELED, *range(first, first + 5)):
-        fields.append(plate.fields(ROWS, np.full(4, node), weights, touched.points))
-    nominal, thinnest, thinner, middle, _, thickest = fields
-
-    nodes = thickness_nodes(5)
-    frequency_factor = math.sqrt(2) if modulus else 1.0
-    thickness_factor = math.sqrt(0.5) if modulus else 1.0
-    for at_node, node in ((thinnest, nodes[0]), (thinner, nodes[1]), (thickest, nodes[4])):
-        deviation = 0.02 * float(node)
-        thickness = 1 + thickness_factor * deviation
-        frequency = 1 + frequency_factor * deviation
-        stiffer = round((frequency / thickness) ** 2, 12)
-        by_era = direct_fields(Variation(thickness=thickness, modulus=stiffer))
-        exact = np.einsum("e,fep->fp", DRIVE, by_era)
-        assert largest_error(at_node, exact) < 5e-3, node
-    size = float(np.abs(nominal).max())
-    np.testing.assert_allclose(middle, nominal, rtol=1e-3, atol=1e-4 * size)
-    assert np.abs(thinnest + thickest - 2 * nominal).max() > 0.1 * size
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")

@@ -94,18 +94,6 @@ def test_identified_rig_states_less_uncertainty_except_for_fingers(
     assert uncertainty.common_gain == pytest.approx(0.05 / np.sqrt(8), rel=0.05)
 
 
-def test_identified_rig_keeps_its_accuracy_when_few_tones_follow(
-    identification: Identification, measurement: Measurement
-) -> None:
-    """A third of the tones alone would leave more uncertainty than the rig already has."""
-    is_third = np.arange(len(FREQUENCIES))[:, None, None] % 3 == 0
-
-    uncertainty = identify(identification.rig, measurement.part(is_third)).rig.uncertainty
-
-    assert uncertainty.stiffness < 0.02
-    assert uncertainty.thickness < 0.005
-
-
 @pytest.mark.long
 def test_same_data_again_do_not_change_the_level(rig: Rig) -> None:
     """The level and its uncertainty stay, since the sensors may be the same.
@@ -320,24 +308,6 @@ def test_plate_of_another_kind_is_not_explained(rig: Rig, measurement: Measureme
     assert identify(rig, replace(measurement, values=values)).chi2 > MAX_CHI2
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("sensors", [3, 4])
-def test_bonded_frame_is_not_known_well_by_sensors_at_feet(rig: Rig, sensors: int) -> None:
-    """Modes stiffened along the edges (bending +80 %, mass +35 %) leave chi² below 2.
-
-    Nothing is promised of such a plate. An uneven plate, whose error of fields is known, is fine.
-    """
-    frame = identify(rig, at_eras(rig, draw("frame", 1), seed=[1, 1], sensors=sensors))
-    uneven = identify(rig, at_eras(rig, draw("uneven", 3), seed=[3, 1], sensors=sensors))
-
-    assert frame.chi2 < 2
-    assert not frame.is_explained
-    assert "does not explain" in fit_rows(frame)[0]
-    assert frame.rig.uncertainty == rig.uncertainty
-    assert identification_json(frame, [])["known_well"] is False
-    assert uneven.is_explained
-
-
 # Moduli of a board
 
 PLYWOOD = """\
@@ -437,17 +407,6 @@ def with_lag(space: Space) -> FloatArray:
     return parameters
 
 
-def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None:
-    """By hand: at its resonance of 500 Hz, with a damping ratio of 0.3, 1 / (2 i 0.3) times."""
-    at_resonance = replace(model, frequencies=np.array([500.0]))
-
-    responses = at_resonance.at(with_lag(model.space)).responses[0]
-
-    expected = at_resonance.at(np.zeros(model.space.size)).responses[0]
-    expected[:, 1] /= 0.6j
-    np.testing.assert_allclose(responses, expected)
-
-
 def test_rig_with_a_lagging_drive_keeps_its_measured_gains(model: ForwardModel) -> None:
     """By hand: the measured gain times the lag of a resonance at 500 Hz."""
     southwest, southeast, *others = model.rig.eras
@@ -461,22 +420,6 @@ def test_rig_with_a_lagging_drive_keeps_its_measured_gains(model: ForwardModel) 
     kilohertz = 1e-3 * frequencies
     lag = 1 - 4.0 * kilohertz**2 + 1.2j * kilohertz
     np.testing.assert_allclose(gain, measured_era.gain(frequencies) / lag, rtol=1e-3)
-
-
-def test_copied_model_with_another_plate_has_the_shapes_of_that_plate(
-    model: ForwardModel, laminate_model: ForwardModel
-) -> None:
-    """A laminate responds as its own solution does, after the rig's plate at the same positions."""
-    nominal, rig = np.zeros(model.space.size), laminate_model.rig
-    _ = model.at(nominal).responses
-
-    responses = laminate_model.at(nominal).responses[:, -1]
-
-    pad = np.array([[PAD.x, PAD.y]])
-    free = laminate_model.free
-    fields = free.acceleration(rig.eras, MODEL_FREQUENCIES, pad, loads=rig.masses)
-    expected = fields[..., 0] / [era.full_level for era in rig.eras]
-    np.testing.assert_allclose(responses, expected, rtol=1e-5)
 
 
 # Boards on exciters, and sensors that are moved

@@ -20,7 +20,6 @@ import pytest
 from cases import read_yaml, shortly
 from era_haptics.command import run_era
 from era_haptics.lab.measuring import measure
-from examples.make_measured import Accelerometer, record_responses, scanning_grid
 from kit import plates
 from kit.plates import (
     DISTORTIONS,
@@ -48,7 +47,6 @@ from model.response_files import (
     read_measured,
     write_responses,
     write_responses_csv,
-    write_responses_uff,
 )
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
@@ -513,27 +511,6 @@ def test_calibrate_writes_no_rig_for_a_dead_exciter(
     assert not files.output.exists()
 
 
-@pytest.mark.parametrize("name", shortly(["csv", "uff"], ["uff"]))
-def test_exchanged_plugs_are_found_in_a_file_of_a_modal_test(
-    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Responses recorded in time, with two plugs exchanged; the file has the names of the rig."""
-    path, file = write_rig(tmp_path / "rig.yaml", mesh="12x9"), tmp_path / f"measured.{name}"
-    rig = load_rig(path)
-    sensors = scanning_grid(rig.plate, 3, 2, like=Accelerometer("", 0, 0, noise_density=5e-3))
-    responses = record_responses(rig, sensors, np.linspace(61, 461, 6))
-    exchanged = replace(responses, values=responses.values[..., [0, 3, 2, 1]])
-    write = write_responses_csv if name == "csv" else write_responses_uff
-    write(file, exchanged, rig)
-
-    assert run_era(["rig", "check", str(path), "--measured", str(file)]) == 1
-
-    output = capsys.readouterr().out
-    assert "SWAPPED: channel 1 of amplifier main (ERA SE in the rig) drives ERA NW" in output
-    assert "PLATE" not in output
-    assert "INVERTED" not in output
-
-
 def test_check_fails_for_a_plate_that_misses_its_promises(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -617,16 +594,6 @@ def test_verdict_states_loss_and_stiffness_of_the_plate(
         assert verdict.is_well
         np.testing.assert_allclose([*verdict.changes.values()], 0, atol=0.05)
         assert (verdict.kept_share or 0) > 0.9
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["places-from-the-other-corner", "frequencies-backwards"])
-def test_reversed_axes_are_rejected_before_a_calibration(name: str) -> None:
-    """The message names the axes."""
-    case = SCENARIOS[name]
-
-    with pytest.raises(InputError, match=" and ".join(case["mirrored"])):
-        check_consistency(*planted(case))
 
 
 @pytest.fixture(scope="module")

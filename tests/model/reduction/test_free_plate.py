@@ -38,9 +38,7 @@ from model.structure.laminate_bending import equivalent_plate
 from model.structure.material import Material
 from model.structure.plate import LOSS_FREQUENCY, AirGap, Laminate, LaminateLayer, Plate
 from model.structure.sources import Era
-from model.study.verification import verify_table
 from model.table.table_file import TableProblem, build_table
-from model.vibration import natural_modes
 
 PAPER = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
 
@@ -66,53 +64,6 @@ def free(request: pytest.FixtureRequest) -> FreePlate:
 
 
 # Responses with attachments
-
-
-def random_era(name: str, rng: np.random.Generator) -> Era:
-    """An ERA anywhere, from hardly there (10 N/m) to as good as clamped (1e8 N/m)."""
-    return Era(
-        name,
-        x=rng.uniform(0, LENGTH),
-        y=rng.choice([0, WIDTH, rng.uniform(0, WIDTH)]),
-        stiffness=10 ** rng.uniform(1, 8),
-        damping=10 ** rng.uniform(-2, 2),
-        bolt_mass=rng.choice([0.0, 0.003, 0.05]),
-        stroke=1e-4,
-    )
-
-
-def random_loads(rng: np.random.Generator) -> list[PointLoad]:
-    """Up to three fingers and a mass, anywhere."""
-    positions = rng.uniform(0, (LENGTH, WIDTH), (rng.integers(1, 5), 2)).tolist()
-    x, y = positions.pop()
-    loads = [PointLoad(x, y, mass=0.02)]
-    for x, y in positions:
-        loads.append(PointLoad(x, y, 10 ** rng.uniform(2, 4), 2.0, 2e-4))
-    return loads
-
-
-def test_acceleration_equals_direct_solve_for_any_layout(free):
-    """One solved plate is within 1e-4 (relative L2) of a direct solve.
-
-    One to six ERAs of any stiffness, bolts, fingers, a mass; frequencies anywhere up to 500 Hz and
-    at a resonance of each layout.
-    """
-    rng = np.random.default_rng(7)
-    matrices = assemble(free.plate, free.mesh)
-    points = free.mesh.nodes[::3]
-
-    for _ in range(3):
-        eras = tuple(random_era(f"E{number}", rng) for number in range(rng.integers(1, 7)))
-        loads = random_loads(rng)
-        rig = replace(make_paper_rig(12, 9), eras=eras)
-        natural = natural_modes(rig, 12, support="eras", mesh=free.mesh).frequencies
-        resonance = rng.choice(natural[(natural > 5) & (natural < 500)])
-        frequencies = np.array([*rng.uniform(5, 500, 3), resonance, 500.0])
-
-        response = free.acceleration(eras, frequencies, points, loads=loads)
-
-        expected = direct_acceleration(matrices, eras, frequencies, points, loads=loads)
-        assert_within(response, expected, 1e-4)
 
 
 @dataclass(frozen=True)
@@ -363,20 +314,6 @@ def test_reduced_plate_response_equals_direct_solve(shares):
     assert_within(np.array(response), expected, 3e-5)
 
 
-def test_projection_needs_the_origin_of_both_reductions() -> None:
-    """No projection is guessed from a reduction of which only the coordinates are known."""
-    corners = np.array(CORNERS) * (LENGTH, WIDTH)
-    reduced = reduce_plate(PAPER, COARSE, corners)
-    without_origin = replace(reduced, origin=None)
-
-    with pytest.raises(ValueError, match="only the coordinates of one"):
-        reduced.projection_from(without_origin)
-    with pytest.raises(ValueError, match="only the coordinates of one"):
-        without_origin.projection_from(reduced)
-    identity = np.eye(len(reduced.omega))
-    np.testing.assert_allclose(reduced.projection_from(reduced), identity, atol=1e-6)
-
-
 def test_slopes_are_those_of_waves() -> None:
     """Inside, near edges and at corners, to 2e-6 of the wave number, from points on the plate."""
     sides = np.array([0.3, 0.2])
@@ -491,17 +428,6 @@ def test_deviations_change_the_receptance_of_their_modes_alone(
         shape = shapes[:, mode]
         expected += change[:, None, None] * np.outer(shape, shape)
     np.testing.assert_allclose(receptances, expected, atol=1e-12 * np.abs(expected).max())
-
-
-def test_table_is_verified_with_its_deviations(deviating_rig: Rig, nominal_rig: Rig) -> None:
-    """Fields and answers are those of the plate with its deviations, not of the theory."""
-    table = build_table(deviating_rig)
-
-    verification = verify_table(table, deviating_rig, samples=4)
-    nominal_verification = verify_table(table, nominal_rig, samples=1)
-
-    assert verification.failed_count == 0
-    assert {content.is_passed for content in nominal_verification.content} == {False}
 
 
 def test_plate_in_time_has_its_deviations(deviating_rig: Rig) -> None:

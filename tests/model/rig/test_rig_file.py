@@ -24,7 +24,6 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig import rig_writing
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
-from model.rig.rig_mesh import parse_mesh
 from model.rig.rig_warnings import gain_notes
 from model.rig.rig_writing import fitted_keys, save_beside, save_fitted, save_rig
 from model.structure.attachments import PointLoad
@@ -110,13 +109,6 @@ def test_load_rig_converts_units_and_fills_in_defaults(tmp_path: Path) -> None:
     assert rig.uncertainty == Uncertainty(0.05, 5.0, 0.02, 0.1, 1.5, 0.5)
 
 
-def test_position_off_the_corner_by_rounding_is_the_corner() -> None:
-    """A coordinate that exceeds the plate by the error of an addition is the plate's side."""
-    rig = good_rig(("[0.3048,", "[0.30480000000000007,"))
-
-    assert rig.eras[1].x == 0.3048
-
-
 def test_gains_are_read_in_radians() -> None:
     """A row of gains is a frequency, a factor and a phase in degrees."""
     rig = good_rig(("damping: 2.0", "gains: [[50, 0.9, 90], [60, 1, 0]]"))
@@ -156,17 +148,6 @@ def test_laminate_has_the_mass_and_thickness_of_its_layers() -> None:
     assert rig.laminate.thickness == pytest.approx(3.2e-3)
     assert rig.laminate.bond == "full"
     assert good_rig((HOMOGENEOUS, single_layer)).fingerprint == good_rig().fingerprint
-
-
-def test_names_and_order_of_masses_do_not_change_the_fingerprint() -> None:
-    """A fingerprint identifies the physics: the same two masses at the same positions."""
-    camera, plug = "{at: [50 mm, 9 in], mass: 20 g}", "{at: [0, 0], mass: 5 g}"
-
-    rig = parse_rig("rig.yaml", f"{GOOD}masses: {{camera: {camera}, plug: {plug}}}")
-    renamed = parse_rig("rig.yaml", f"{GOOD}masses: {{plug: {plug}, eye: {camera}}}")
-
-    assert rig.masses == (PointLoad(0.05, 0.2286, mass=0.02), PointLoad(0.0, 0.0, mass=0.005))
-    assert renamed.fingerprint == rig.fingerprint
 
 
 def test_fingertip_is_changed_key_by_key_or_left_out() -> None:
@@ -255,20 +236,6 @@ def test_mesh_is_chosen_for_the_highest_frequency_when_missing() -> None:
     assert without_mesh.mesh.shortest_wavelength < 0.1713
     assert without_limits.mesh == without_mesh.mesh
     assert without_limits.limits == replace(without_mesh.limits, level=1.0)
-
-
-@pytest.mark.parametrize("text", ["48x36", "48X36", " 48 x 36 ", "48×36"])
-def test_mesh_is_written_in_common_spellings(text: str) -> None:
-    """Letter, case and spaces between the two numbers do not matter."""
-    mesh = parse_mesh(text, good_rig().plate)
-
-    assert (mesh.nx, mesh.ny, mesh.length, mesh.width) == (48, 36, 0.3048, 0.2286)
-
-
-def test_unknown_era_is_rejected_with_a_suggestion() -> None:
-    """The message lists the ERAs of the rig and the name that was probably meant."""
-    with pytest.raises(InputError, match=r"'sww'; did you mean SW\? choose from SW, NE"):
-        good_rig().era("sww")
 
 
 # Invalid values
@@ -489,17 +456,6 @@ def test_check_warns_of_friction_in_a_thin_air_gap(
         assert str(error) in warning
 
 
-def test_check_warns_of_a_thickness_that_no_shop_sells(tmp_path: Path) -> None:
-    """6.4 cm of plywood were probably meant to be 6.4 mm."""
-    plywood = changed(GOOD, ("aluminium", "plywood"))
-    path = tmp_path / "rig.yaml"
-
-    (warning,) = warnings_about("plate.thickness", changed(plywood, ("1.5 mm", "6.4 cm")), path)
-
-    assert "64 mm" in warning
-    assert warnings_about("plate.thickness", changed(plywood, ("1.5 mm", "18 mm")), path) == []
-
-
 def test_check_warns_of_faces_that_slide_on_soft_foam(tmp_path: Path) -> None:
     """By hand sqrt(2 x 40e3 / (0.05 x 1.767)) / 2 pi = 151 Hz for foam of G 40 kPa.
 
@@ -562,18 +518,6 @@ def test_check_lists_eras_whose_gain_is_not_measured() -> None:
     assert joint_note == note.replace("SW", "SW, SE")
     assert gain_notes(four_era_rig(("full_level: output", "full_level: motion"))) == []
     assert gain_notes(exciter_rig()) == []
-
-
-def test_check_warns_of_gains_that_are_measured_too_far_apart() -> None:
-    """Halfway between rows 90 degrees apart a straight line has 0.7 of the gain.
-
-    179 and -176 degrees are 5 apart. Rows beyond the frequency limits are not played.
-    """
-    rows = "gains: [[40, 2, 179], [150, 2, -176], [255, 2, 94], [300, 2, 90], [320, 2, 0]]"
-
-    _, note = gain_notes(four_era_rig((GAINS, rows)))
-
-    assert note.startswith("eras.SE.gains: phases differ by 90 degrees between 150 and 255 Hz")
 
 
 def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(coarse_rig: Rig) -> None:
@@ -812,46 +756,6 @@ def test_fitted_mass_is_written_next_to_the_supports_of_the_base(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("stiffnesses", "tolerance"),
-    [((345.67800001, 345.678), 0.05), ((1600.0, 1600.0), 0.3)],
-    ids=["nearly equal", "default tolerance"],
-)
-def test_fitted_feet_keep_their_order_and_tolerance(
-    tmp_path: Path, stiffnesses: tuple[float, float], tolerance: float
-) -> None:
-    """Each foot gets its own stiffness, even if both differ by less than a file usually prints."""
-    feet = "supports: {a: {at: [0.1, 0.1], kind: foam}, b: {at: [0.2, 0.1], kind: foam}}\n"
-    rig = read_base(tmp_path, changed(FLOW, ("mesh: 12x9", f"{feet}mesh: 12x9")))
-    foot, second_foot = rig.masses
-    fitted_feet = (
-        replace(foot, stiffness=stiffnesses[0]),
-        replace(second_foot, stiffness=stiffnesses[1]),
-    )
-    uncertainty = replace(rig.uncertainty, supports=tolerance)
-
-    path = write_fit(tmp_path, rig, replace(rig, masses=fitted_feet, uncertainty=uncertainty))
-    result = load_rig(path)
-
-    assert [(load.x, load.stiffness) for load in result.masses] == [
-        (0.1, stiffnesses[0]),
-        (0.2, stiffnesses[1]),
-    ]
-    assert result.uncertainty == uncertainty
-
-
-def test_fit_writes_only_changed_terms_of_the_uncertainty(tmp_path: Path) -> None:
-    """The other terms stay those of the base."""
-    rig = read_base(tmp_path)
-    uncertainty = replace(rig.uncertainty, gain=0.01)
-
-    result = load_rig(write_fit(tmp_path, rig, replace(rig, uncertainty=uncertainty)))
-
-    assert result.document is not None
-    assert result.document.over.data["uncertainty"] == {"gain": 0.01}
-    assert result.uncertainty == uncertainty
-
-
-@pytest.mark.parametrize(
     ("old", "new", "error"),
     [
         ("base: rig.yaml", "base: ring.yaml", r":\d+: base: must be an existing rig file"),
@@ -879,27 +783,6 @@ def test_fitted_file_with_an_invalid_base_or_key_is_rejected(
 
     with pytest.raises(ConfigError, match=rf"rig\.fitted\.yaml.*{error}"):
         load_rig(path)
-
-
-def test_base_can_be_wired_differently_after_a_fit(tmp_path: Path) -> None:
-    """URL, channels, limits and units of the base can change, since the physics stays the same."""
-    rig = read_base(tmp_path)
-    path = write_fit(tmp_path, rig, fitted_rig(rig))
-
-    read_base(
-        tmp_path,
-        changed(
-            FLOW,
-            ("sim://", "serial:///dev/ttyS9"),
-            ("2 mm", "0.002"),
-            ("[0.3, 0]", "[30 cm, 0 mm]"),
-            ("channel: 2", "channel: 5"),
-        ),
-    )
-    result = load_rig(path)
-
-    assert result.amplifiers == {"m": "serial:///dev/ttyS9"}
-    assert result.wiring["C"].number == 5
 
 
 @pytest.mark.parametrize(

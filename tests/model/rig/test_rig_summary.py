@@ -7,7 +7,7 @@ rigid plate and in a summary; a field is written and read back.
 import json
 import math
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,14 @@ from kit.plates import exciter_rig, exciter_rig_text
 from model.arrays import ComplexArray
 from model.commands.plate_show_cli import show
 from model.config.document import ConfigError, data_text, parse_document
-from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.plate_sections import PLAIN_KEYS, PlateSection
-from model.rig.rig import Rig, Uncertainty, differences
+from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, parse_rig, rig_of
 from model.rig.rig_summary import plate_summary
 from model.rig.rig_warnings import exciter_notes, resonance_notes
 from model.rig.rig_writing import document_for
 from model.structure.exciter import EXCITER_TYPES, Exciter
-from model.structure.material import Material
-from model.structure.plate import AirGap, Laminate, Plate
 from model.structure.statics import rigid_body_frequencies
 from model.transients.excursions import excursion_notes
 from model.vibration import natural_modes
@@ -98,45 +95,6 @@ def test_key_changes_elements_polynomials_and_summary_alike(key: str) -> None:
     assert modes == pytest.approx(rigid_body_frequencies(soft_rig.plate, soft_rig.eras), rel=1e-3)
     rows = {**summary, **summary["further"]}
     assert rows[QUANTITIES[key].dimension.key(key)] == getattr(soft_rig.plate, key)
-
-
-LAYERS = [{"material": {**GLASS, "name": name}, "thickness": 0.001} for name in "ab"]
-KEYS_WITH_FIELD: dict[str, dict[str, Any]] = {
-    "laminate": {"layers": LAYERS},
-    "air_gap": {"material": GLASS, "thickness": 0.002, "air_gap": {"depth": 0.004}},
-}
-
-
-def with_changed_field(rig: Rig, name: str) -> Rig:
-    """The rig with another value of a field of its plate, on the same mesh."""
-    plate = rig.plate
-    match getattr(plate, name):
-        case float() as value:
-            return replace(rig, plate=replace(plate, **{name: 1.01 * value or 0.1}))
-        case Laminate() as laminate:
-            laminate = laminate.scaled(modulus=1.02)
-            return replace(rig, plate=plate.scaled(modulus=1.02), laminate=laminate)
-        case Material():
-            return replace(rig, plate=plate.scaled(modulus=1.02))
-        case AirGap() as gap:
-            return replace(rig, plate=replace(plate, air_gap=replace(gap, depth=0.005)))
-    assert name == "mode_deviations"
-    deviations = ((2 * math.log(1.02), math.log(0.9)),)  # a row of six digits in the file
-    return replace(rig, plate=replace(plate, mode_deviations=deviations))
-
-
-# A surface takes the place of all other keys of a plate: tests/model/structure/test_surface.py.
-@pytest.mark.parametrize("name", [field.name for field in fields(Plate) if field.name != "surface"])
-def test_changed_field_is_written_and_read_back(name: str) -> None:
-    """Every field, also a new one, is in the text of the rig."""
-    keys = KEYS_WITH_FIELD.get(name, {"material": GLASS, "thickness": 0.002})
-    rig = rig_on_springs({"length": 0.3, "width": 0.2, **keys}, "10x8 Legendre")
-    changed = with_changed_field(rig, name)
-
-    result = rig_of(document_for(changed))
-
-    assert differences(result, changed) == []
-    assert differences(result, rig) != []
 
 
 # Exciters
@@ -209,15 +167,6 @@ def test_types_are_those_of_their_sheets(
 def test_invalid_exciter_is_rejected_with_its_key(keys: str, key: str, message: str) -> None:
     """An ambiguous or missing resonance, keys that only ERAs have, and too much power."""
     assert message in problems_of(keys)[key]
-
-
-def test_misspelled_type_is_one_problem_per_exciter() -> None:
-    """The values of the type are not reported as missing; a type is not blamed for another key."""
-    problems = problems_of("type: DAEX25CT-5")
-
-    assert "did you mean DAEX25CT-4" in problems["type"]
-    assert len(problems) == 4
-    assert "DAEX25CT-4" not in str(problems_of("type: DAEX25CT-4, q: -1"))
 
 
 @pytest.mark.parametrize(
@@ -352,19 +301,6 @@ def test_check_warns_of_what_can_harm_an_exciter(keys: str, key: str, message: s
 
     about_key = [note for note in notes if note.startswith(f"eras.SW.{key}")]
     assert message in "\n".join(about_key), notes
-
-
-def test_sound_exciter_has_no_warning() -> None:
-    """With an excursion of 9 mm nothing can harm it."""
-    notes = notes_of(f"{FREE_COIL}, excursion: 9 mm", "[100, 300]")
-
-    assert [note for note in notes if "eras" in note] == []
-
-
-def test_current_that_cannot_follow_is_rejected() -> None:
-    """5 mH with a force factor of 10 T m."""
-    with pytest.raises(InputError, match="inductance of exciter SW must let"):
-        exciter_rig("type: DAEX25CT-4, force_factor: 10, inductance: 5 mH")
 
 
 @pytest.mark.parametrize(

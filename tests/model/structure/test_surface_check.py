@@ -455,16 +455,6 @@ def test_complex_modes_are_scaled_by_their_modal_a_or_mass(
     np.testing.assert_allclose(signs * shapes, expected, atol=1e-4 * np.abs(expected).max())
 
 
-def test_complex_modes_without_a_modal_mass_are_rejected(tmp_path: Path) -> None:
-    """Data set 55 has no scale for modes of second order; the message names the line."""
-    text = complex_universal(FEW_MODES, kind=55, analysis=7, has_conjugates=False)
-
-    with pytest.raises(
-        InputError, match=r"modes\.uff:\d+: analysis type of a mode must be 2 or 3, got 7"
-    ):
-        read_modes(tmp_path / "modes.uff", text.encode())
-
-
 def test_complex_modes_without_modal_a_are_rejected(tmp_path: Path) -> None:
     """A modal A of 0 gives no scale; the message names the line."""
     text = complex_universal(FEW_MODES, kind=55, analysis=3, has_conjugates=False)

@@ -31,9 +31,7 @@ from model.cli import app
 from model.errors import InputError
 from model.finger import Grid
 from model.rig.rig import Channel, Rig, Uncertainty
-from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
-from model.study import table_export
 from model.study.overview import find_overview, summarize
 from model.study.promise_cost import PromiseCost, clock_cost, tolerance_costs
 from model.study.table_export import export_csv, export_mat
@@ -41,7 +39,6 @@ from model.study.weak_cells import (
     WeakCells,
     contrasts_of,
     find_weak_cells,
-    map_grid,
     pair_questions,
     text_map,
 )
@@ -188,29 +185,6 @@ def test_export_mat_has_layers_and_air(table: LocalizationTable, tmp_path: Path)
     assert struct.air_gap.closed == 1
 
 
-def test_export_mat_has_a_mass(table: LocalizationTable, tmp_path: Path) -> None:
-    """As a struct."""
-    shapes = np.vstack([table.attachment_shapes, table.attachment_shapes[:1]])
-    mass = PointLoad(0.1, 0.15, mass=0.06)
-
-    struct = exported(replace(table, masses=(mass,), attachment_shapes=shapes), tmp_path)
-
-    assert struct.masses.mass_kg == 0.06
-    assert struct.masses.y_m == 0.15
-
-
-def test_export_mat_refuses_a_large_table(
-    table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before anything is written; the error names a remedy."""
-    monkeypatch.setattr(table_export, "MAX_MAT_BYTES", 1000)
-
-    with pytest.raises(InputError, match="numpy"):
-        export_mat(table, tmp_path / "t.mat")
-
-    assert list(tmp_path.iterdir()) == []
-
-
 def csv_rows(table: LocalizationTable, folder: Path, content: str) -> list[dict[str, str]]:
     """Return the rows of a table's .csv file."""
     path = folder / "t.csv"
@@ -255,18 +229,6 @@ def test_export_csv_has_answers_in_the_drive_mode_of_the_table(
         assert float(row["promised_level_db_sl"]) >= 20 - 1e-3
 
 
-def test_export_csv_has_fields(table: LocalizationTable, tmp_path: Path) -> None:
-    """A row for each raster point and frequency, both parts of each ERA's field, to the bit."""
-    rows = csv_rows(table, tmp_path, "fields")
-
-    assert len(rows) == table.raster.point_count * 3
-    row = rows[3 * 7 + 2]
-    assert (float(row["x_m"]), float(row["y_m"])) == tuple(table.raster.points[7])
-    assert row["frequency_hz"] == "250.0"
-    field = complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"]))
-    assert np.complex64(field) == table.unit_fields(table.raster.points)[2, 2, 7]
-
-
 # Contrast maps
 
 QUIET = (0.2286, 0.0381)  # m; center of the fourth cell of the lowest row
@@ -302,18 +264,6 @@ def test_map_has_the_answer_of_every_place(
         assert promised == pytest.approx(sensation.promised_contrast_db, abs=1e-3), place
         nominal = contrasts.nominal_db[mode][row, column]
         assert nominal == pytest.approx(sensation.contrast_db, abs=1e-3), place
-
-
-def test_map_is_a_frame(contrasts: era.ContrastMap) -> None:
-    """Places along x come first, with a column for each mode and figure."""
-    frame = contrasts.to_frame()
-
-    assert frame.shape == (15, 6)
-    promised = contrasts.promised_db["phased"]
-    best = frame.loc[frame["phased_promised_db"].idxmax()]
-    row, column = np.unravel_index(np.nanargmax(promised), promised.shape)
-    assert best["x_m"] == contrasts.x[column]
-    assert best["y_m"] == contrasts.y[row]
 
 
 def test_command_prints_the_map(
@@ -402,14 +352,6 @@ def test_weak_and_feasible_follow_from_12_db() -> None:
     assert weak.feasible.tolist() == [True, True, False, False]
     assert weak.weak.tolist() == [False, True, True, True]
     assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
-
-
-@pytest.mark.parametrize(
-    ("grid", "expected"), [(Grid(24, 5), Grid(8, 5)), (Grid(4, 20), Grid(4, 6))], ids=["x", "y"]
-)
-def test_map_has_at_most_8_by_6_cells(table: LocalizationTable, grid: Grid, expected: Grid) -> None:
-    """Fewer if the table has."""
-    assert map_grid(replace(table, grid=grid)) == expected
 
 
 def test_summary_of_a_plate_too_small_for_two_fingers() -> None:

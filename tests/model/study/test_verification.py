@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, truncnorm
 
 from kit.direct_plate import direct_acceleration
 from kit.outside_files import EXAMPLES
@@ -19,7 +18,6 @@ from kit.plates import (
     make_paper_rig,
     small_table,
     smooth_rig,
-    smooth_table,
 )
 from kit.set_table import only
 from model.answer.answer import Layer
@@ -269,21 +267,6 @@ def test_felt_on_agrees_with_the_direct_solve(target_count: int, mode: str) -> N
     assert sensation.contrast_db == pytest.approx(direct[0], abs=0.15)
 
 
-def test_felt_on_agrees_with_the_direct_solve_for_fingers_that_press() -> None:
-    """Contrasts of fingers with equal loads are off by more."""
-    pressed = (2.5, 0.4, 1.0)
-    placed = Placement((TARGET,), QUIET, pressed)
-    layer, sensation = only(table_on_feet(), placed, drive_mode="phased")
-
-    _, contrasts = felt_on(table_on_feet(), placed, layer.excitation, THREE_PLATES)
-
-    direct = [direct_contrast(layer, number, pressed=pressed) for number in range(3)]
-    unpressed = [direct_contrast(layer, number) for number in range(3)]
-    np.testing.assert_allclose(20 * np.log10(contrasts), direct, atol=0.15)
-    assert sensation.contrast_db == pytest.approx(direct[0], abs=0.15)
-    assert np.abs(np.subtract(unpressed, direct)).max() > 0.2
-
-
 def test_object_that_can_lie_anywhere_is_an_error_of_fields() -> None:
     """5 g: six times its mean square, over plates solved with the mass at each place, to 10 %."""
     rig = make_paper_rig(12, 9)
@@ -306,34 +289,10 @@ def test_object_that_can_lie_anywhere_is_an_error_of_fields() -> None:
     np.testing.assert_allclose(power, 6 * np.mean(mean_squares, axis=0), rtol=0.1)
 
 
-def test_error_power_is_the_error_of_the_direct_field() -> None:
-    """One ERA driven: its field over the plate by the direct solve, mean square, times it."""
-    rig = smooth_rig()
-    table = smooth_table()
-    frequency = table.frequencies[[8]]
-
-    power = table.error_power[8, 1]
-
-    matrices = assemble(rig.plate, rig.mesh)
-    (fields,) = direct_acceleration(matrices, rig.eras, frequency, table.raster.points)
-    mean_square = np.mean(np.abs(fields[1]) ** 2)
-    expected = table.discretization_error[8] ** 2 * mean_square
-    assert power == pytest.approx(expected, rel=1e-3)
-
-
 def plates_on_feet(uncertainty: Uncertainty, count: int) -> Plates:
     """Return plates drawn from an uncertainty, for two contacts."""
     rng = np.random.default_rng(0)
     return draw_plates(rng, uncertainty, of=ON_FEET, count=count, contact_count=2)
-
-
-def test_springs_of_drawn_plates_are_positive() -> None:
-    """At the largest uncertainty they have the distribution of a normal number cut off at 0."""
-    stiffness = plates_on_feet(replace(Uncertainty(), stiffness=0.5), 1000).stiffness
-
-    assert stiffness.min() > 0
-    expected = truncnorm(-2, np.inf, loc=1, scale=0.5)
-    assert kstest(stiffness.ravel(), expected.cdf).pvalue > 0.01
 
 
 def test_drawn_plates_have_the_spreads_of_the_uncertainty() -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from kit.direct_plate import direct_acceleration
 from kit.plates import contact_sets, make_paper_rig, smooth_rig, smooth_table
-from kit.set_table import only
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
@@ -48,11 +47,6 @@ def test_highest_level_is_that_of_the_best_pattern() -> None:
         assert levels[position] == pytest.approx(max(sensations), rel=1e-5), position
 
 
-def test_patterns_are_one_or_two_eras() -> None:
-    """Four ERAs alone and six pairs at 27 frequencies: 4 * 27 + 6 * 27² = 4482 different ones."""
-    assert smooth_table().pattern_count == 4482
-
-
 @pytest.mark.parametrize("mode", ["switched", "phased"])
 def test_query_predicts_the_direct_solution(mode: str) -> None:
     """Level, contrast and the loudest quiet level, by the sparse direct solve with fingers on."""
@@ -80,21 +74,6 @@ def test_query_predicts_the_direct_solution(mode: str) -> None:
     quiet_level = sensation.level_db_sl - sensation.contrast_db
     loudest = 20 * np.log10(sensed[len(weights) :].max())
     assert quiet_level == pytest.approx(loudest, abs=0.1)
-
-
-def test_query_scales_the_drive_with_the_level() -> None:
-    """1 dB less is 0.89 of the stroke of the same ERAs; a softer level admits every pattern."""
-    placed = Placement(((0.1, 0.1),), ((0.2, 0.1),))
-
-    loud, strong = only(smooth_table(), placed, 20.0)
-    softer, weaker = only(smooth_table(), placed, 19.0)
-    _, soft = only(smooth_table(), placed, -20.0)
-
-    assert soft.promised_contrast_db >= strong.promised_contrast_db - 0.5
-    assert weaker.contrast_db == pytest.approx(strong.contrast_db)
-    amplitudes = {name: tone.amplitude for name, tone in softer.excitation.items()}
-    expected = {name: 0.891251 * tone.amplitude for name, tone in loud.excitation.items()}
-    assert amplitudes == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -188,12 +167,6 @@ def test_raster_fits_thin_and_small_plates(thickness: float) -> None:
     np.testing.assert_allclose(height, [[0.029]], rtol=1e-5)
 
 
-def test_raster_needs_six_points_on_each_side() -> None:
-    """Five points carry no quintic."""
-    with pytest.raises(InputError, match="6 to"):
-        Raster(5, 9, 0.1, 0.1)
-
-
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
 
 
@@ -217,12 +190,3 @@ def test_frequency_that_a_table_lacks_is_refused(
         table.amplitudes(tones, POINTS)
     with pytest.raises(InputError):
         felt_on(table, Placement(((0.08, 0.06),)), tones, plates)
-
-
-def test_frequency_within_a_step_of_a_wire_is_the_tables_own(table: LocalizationTable) -> None:
-    """Its frequencies are 145 Hz and others."""
-    _, expected = table.amplitudes({"SW": Tone(145.0, 1e-6, 0.0)}, POINTS)
-
-    _, amplitudes = table.amplitudes({"SW": Tone(145.0004, 1e-6, 0.0)}, POINTS)
-
-    np.testing.assert_array_equal(amplitudes, expected)

@@ -27,7 +27,6 @@ from model.structure.fingertips import Fingertip, FingertipLoad, fingertip_loads
 from model.structure.statics import rigid_body_frequencies
 from model.table.table_file import build_table
 from model.transients.base_motion import shaped
-from model.transients.enveloped_response import enveloped_accelerations
 from model.transients.excursions import (
     CLICKS_APART,
     MagnetMotions,
@@ -198,20 +197,6 @@ def largest_motion(frequency: float, swing: Swing) -> float:
     return float(np.hypot(real_motion, imaginary_motion).max())
 
 
-@pytest.mark.parametrize("frequency", [40.0, 47.0])
-def test_motion_along_a_swinging_level_is_that_of_one_mass(frequency: float) -> None:
-    """A level that swings with the beat of drive and magnet, and a level that lasts."""
-    magnets, times = magnets_on_a_heavy_board(), 0.01 * np.arange(61)
-    beat = 2 * math.pi * (frequency - 27.2)
-    beating_level = (1 - np.cos(beat * times)) / 2
-    lasting_level = np.minimum(times / 0.01, 1)
-
-    for level in (beating_level, lasting_level):
-        swing = Swing(tuple(level.tolist()), 0.01)
-        motions = motions_along(magnets.plate, magnets.rows, frequency, swing)
-        assert motions == pytest.approx([largest_motion(frequency, swing)] * 4, rel=0.02)
-
-
 def test_repeated_pulses_are_bounded_at_the_worst_repetition_rate() -> None:
     """The bound is the largest of trains with any pause, and 10 % above a single pulse."""
     magnets, frequency = magnets_on_a_heavy_board(), 40.0
@@ -347,30 +332,6 @@ def test_settled_vibration_is_that_of_the_frequency_domain(keys: str) -> None:
     differences = np.linalg.norm(settled - expected, axis=2)
     errors = differences / np.linalg.norm(expected, axis=2)
     np.testing.assert_allclose(errors, 0, atol=6e-3, err_msg="by frequency and exciter")
-
-
-def test_envelopes_lead_to_the_settled_vibration() -> None:
-    """A finger that acts by its forces on the plate without it, all exciters at once."""
-    rig = lossless_board("type: DAEX25CT-4")
-    plate, weights = plate_with(rig), np.array([1.0, 0.3j, -0.5, 0.8])
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
-    at_finger = plate.reduced.at(np.array([[FINGER.x, FINGER.y]]))[0]
-
-    levels = weights * [era.full_level for era in rig.eras]
-    at_points = plate.reduced.at(POINTS)
-    responses = enveloped_accelerations(
-        plate,
-        levels,
-        90.0,
-        points=at_points,
-        fingers=[(at_finger, FINGER.fingertip)],
-        envelope=np.hanning(60),
-        step=0.002,
-    )
-
-    loads = (*rig.masses, FINGER)
-    fields = free.acceleration(rig.eras, np.array([90.0]), POINTS, loads=loads)
-    assert responses[-1] == pytest.approx(weights @ fields[0], rel=5e-3)
 
 
 def test_lowest_modes_are_those_of_a_board_and_magnets_by_hand() -> None:

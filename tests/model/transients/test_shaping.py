@@ -10,8 +10,6 @@ from scipy.optimize import minimize
 from kit.plates import (
     STILL,
     faded_base,
-    make_paper_rig,
-    motion_of,
     shaped_base,
 )
 from model.arrays import ComplexArray, FloatArray, Point, lattice
@@ -215,85 +213,6 @@ def test_shaping_accounts_for_errors_of_the_eras(setup: Setup) -> None:
     assert robust_residual < exact_residual - 1
 
 
-@pytest.mark.parametrize(("target", "quiet", "frequency"), PAIRS)
-def test_shaped_ending_is_weaker_at_quiet_fingers(
-    setup: Setup, target: Point, quiet: Point, frequency: float
-) -> None:
-    """Peaks at a quiet finger are lower than without knowing it, above 150 Hz than in a ramp.
-
-    A few periods of a low frequency do not stop a plate that quietly, but they stop it.
-    """
-    rig, transients = setup.rig, setup.transients
-    weights = 0.1 * setup.loaded_weights(frequency, target, quiet)
-    excitation = setup.tones(frequency, weights)
-    points = fingertip_points(*quiet, rig.plate)
-
-    def peak(bases) -> float:
-        felt = transients.acceleration(bases, points, duration=0.1, after=excitation)
-        return float(np.abs(felt).max())
-
-    ending = setup.shaper.ending(excitation, targets=[target], quiet=[quiet])
-    bases = shaped(ending, rig.eras)
-    general_bases = shaped(setup.shaper.ending(excitation), rig.eras)
-    residual = transients.residual_db(excitation, bases)
-
-    assert peak(bases) < 0.7 * peak(general_bases)
-    if frequency < 150:
-        assert residual < -30
-    else:
-        assert peak(bases) < 0.7 * peak(ramped_ending(excitation, rig.eras, ramp=0.02))
-        assert residual < -40
-
-
-@pytest.mark.parametrize(("target", "quiet", "frequency"), PAIRS[1:])
-def test_shaped_onset_follows_its_ramp_at_the_target(
-    setup: Setup, target: Point, quiet: Point, frequency: float
-) -> None:
-    """Nothing within 3 ms, half the amplitude within 35 ms, and most of it by 60 ms."""
-    weights = 0.1 * setup.loaded_weights(frequency, target, quiet)
-    excitation = setup.tones(frequency, weights)
-    onset = setup.shaper.onset(excitation, targets=[target], quiet=[quiet])
-
-    bases = shaped(onset, setup.rig.eras)
-    felt = setup.transients.acceleration(bases, np.array([target]), duration=0.3)
-
-    sizes = np.abs(felt[:, 0])
-    steady = sizes[-800:].max()
-    first_3_ms, first_35_ms, until_60_ms = sizes[:24], sizes[:280], sizes[280:480]
-    assert first_3_ms.max() < 0.1 * steady
-    assert first_35_ms.max() > 0.5 * steady
-    assert until_60_ms.max() > 0.65 * steady
-
-
-def test_envelopes_keep_the_frequency_of_each_era(setup: Setup) -> None:
-    """With two frequencies each ERA keeps its own, and silent ERAs stay silent."""
-    excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(217.0, 6e-5, 1.0)}
-    eras = setup.rig.eras
-
-    onset = setup.shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
-    ending = setup.shaper.ending(excitation)
-
-    frequencies = {name: envelope.frequency for name, envelope in onset.items()}
-    assert frequencies == {"SW": 110.8, "NE": 217.0}
-    assert onset["NE"].knots[-1] == pytest.approx(6e-5 * np.exp(1j))
-    abrupt_ending = ramped_ending(excitation, eras, ramp=0.0)
-    residual = setup.transients.residual_db(excitation, shaped(ending, eras))
-    assert residual < setup.transients.residual_db(excitation, abrupt_ending) - 3
-
-
-def test_silent_era_helps_only_during_an_onset(setup: Setup) -> None:
-    """With a single frequency a silent ERA plays during the onset and is silent afterwards."""
-    excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
-
-    onset = setup.shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
-    ending = setup.shaper.ending(excitation)
-
-    assert set(onset) == {era.name for era in setup.rig.eras}
-    assert onset["SE"].knots[-1] == 0
-    assert onset["SE"].largest > 1e-7
-    assert set(ending) == set(excitation)
-
-
 def test_onset_of_a_lone_finger_keeps_its_surroundings_quiet(setup: Setup) -> None:
     """The plate around moves less, compared with the target, than in a ramp.
 
@@ -371,23 +290,6 @@ def test_acceleration_equals_time_stepping(few_modes: tuple[Rig, PlateInTime]) -
     expected = coordinates @ plate.reduced.at(points).T
     tolerance = 1e-5 * np.abs(expected).max()
     np.testing.assert_allclose(response, expected, atol=tolerance)
-
-
-def test_ramped_onset_and_ending_are_raised_cosines() -> None:
-    """Half way through a ramp the amplitude is half; it is zero or full at the ends."""
-    eras = make_paper_rig(2, 2).eras
-    excitation = {"SE": Tone(50.0, 1e-4, 0.3)}
-    times = np.array([0.0, 0.01, 0.03])
-    shares = np.array([0.0, 0.5, 1.0])
-    tone = 1e-4 * np.sin(2 * math.pi * 50.0 * times + 0.3)
-
-    onset = ramped_onset(excitation, eras, ramp=0.02)
-    ending = ramped_ending(excitation, eras, ramp=0.02)
-
-    moving = [era.name for era, base in zip(eras, onset, strict=True) if base]
-    assert moving == ["SE"]
-    assert motion_of(onset[1], times) == pytest.approx(shares * tone, abs=1e-17)
-    assert motion_of(ending[1], times) == pytest.approx((1 - shares) * tone, abs=1e-17)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

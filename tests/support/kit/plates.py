@@ -77,12 +77,6 @@ def small_table(*, drive_mode: str = "switched") -> LocalizationTable:
     return solve_table(small_problem(), drive_mode=drive_mode)
 
 
-def with_strokes(table: LocalizationTable, factor: float) -> LocalizationTable:
-    """The table of ERAs with other strokes, in which accelerations are in proportion."""
-    eras = tuple(replace(era, stroke=factor * era.stroke) for era in table.eras)
-    return replace(table, eras=eras)
-
-
 SMALL_TABLE_HZ = np.linspace(40.0, 500.0, 27)
 
 

@@ -2,8 +2,6 @@
 
 import json
 import math
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +11,7 @@ from matplotlib.patches import Circle
 from typer.testing import CliRunner
 
 import era_haptics as era
-from era_haptics.drive import as_points, playable_layers
-from kit.plates import make_paper_rig
+from era_haptics.drive import playable_layers
 from model.answer.answer import Layer
 from model.cli import app
 from model.drive_modes import playable_drive_modes
@@ -46,29 +43,6 @@ def test_calibrate_finds_the_values_of_the_example() -> None:
     assert row["before"] == 17000.0
     assert row["after"] == stiffness
     assert row["unit"] == "N/m"
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"eras": 2},
-        {"eras": 4.5},
-        {"eras": "six"},
-        {"layouts": "random:0"},
-        {"layouts": "nosuch.yaml"},
-        {"layouts": "random:3", "finalists": 0},
-        {"lowest": 0.5},
-        {"apart": "wide"},
-        {"where": "middle"},
-    ],
-    ids=str,
-)
-def test_design_refuses_an_argument_by_its_python_name(arguments: dict[str, object]) -> None:
-    """Not by the name of the command's option."""
-    with pytest.raises(era.InputError) as error:
-        era.design(make_paper_rig(12, 9), **arguments)  # type: ignore[arg-type]
-
-    assert "--" not in str(error.value)
 
 
 # Tables and queries
@@ -142,16 +116,6 @@ def test_query_is_the_answer_to_fingers_that_must_feel_one_vibration(
     assert verdicts[1:] == ["shared", "quiet"]
 
 
-def test_answer_depends_on_the_load_of_a_quiet_finger(table: era.LocalizationTable) -> None:
-    """A finger that presses three times as hard."""
-    fingers = [era.Finger(TARGET, era.Stimulus(15.0))]
-
-    light = era.answer(table, fingers, quiet=[era.Finger(QUIET)])
-    heavy = era.answer(table, fingers, quiet=[era.Finger(QUIET, load=3.0)])
-
-    assert heavy.layers != light.layers
-
-
 # Frames and pictures
 
 
@@ -183,14 +147,6 @@ def test_plate_frames_have_a_row_for_each_mode_point_and_moment() -> None:
     playback = PLATE.play({"SW": 110}, TARGET, quiet=[QUIET, OTHER_QUIET]).to_frame()
     assert playback["time_s"].iloc[-1] == pytest.approx(1.0, abs=0.001)
     assert [*playback.columns[1:]] == ["target_1_m_s2", "quiet_1_m_s2", "quiet_2_m_s2"]
-
-
-def test_frames_need_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without it, the error says how to install it."""
-    monkeypatch.setitem(sys.modules, "pandas", None)
-
-    with pytest.raises(era.InputError, match=r"to_frame needs pandas.*pip install pandas"):
-        PLATE.modes.to_frame()
 
 
 def test_draw_answer_shows_fingers_and_levels(table: era.LocalizationTable) -> None:
@@ -243,17 +199,6 @@ def test_commands_for_follows_the_wiring() -> None:
     }
 
 
-def test_open_amplifier_simulates_a_rig_that_was_made_in_python() -> None:
-    """Its default amplifier `sim://` needs no file, and has a channel for each ERA."""
-    plate = era.Plate(length=0.3, width=0.2, thickness=0.0015, material="aluminium")
-    eras = {}
-    for name, position in {"SW": (0, 0), "SE": (0.3, 0), "NE": (0.3, 0.2)}.items():
-        eras[name] = era.Era(at=position, stiffness="17 kN/m")
-
-    with era.open_amplifier(era.rig(plate, eras)) as amplifier:
-        assert amplifier.capabilities["channels"] == 3
-
-
 def test_open_amplifier_applies_the_limits_of_the_rig() -> None:
     """It plays level 0.2, in steps of 1/10000, and refuses 0.21."""
     rig = replace(RIG, limits=replace(RIG.limits, level=0.2))
@@ -298,18 +243,6 @@ def test_drive_may_be_a_frequency_a_share_or_a_tone() -> None:
     }
 
 
-def test_drive_with_several_tones_of_an_era_has_several_excitations() -> None:
-    """The second tone is in an excitation of its own."""
-    half = [era.Drive(110, level=0.5), era.Drive(90, level=0.5)]
-
-    (layer,) = playable_layers({"SW": half, "SE": [110]}, RIG)
-
-    assert layer.excitations == (
-        {"SW": era.Tone(110, 0.5e-4), "SE": era.Tone(110, 1e-4)},
-        {"SW": era.Tone(90, 0.5e-4)},
-    )
-
-
 TOO_LOUD = [era.Drive(110, 0.7), era.Drive(250, 0.6)]
 REFUSED_DRIVES = {
     "unknown ERA": ({"XX": 110}, "XX'; choose from SW, SE, NE, NW"),
@@ -338,22 +271,3 @@ def test_drive_is_refused_with_its_era_and_value(case: str) -> None:
     drive, message = REFUSED_DRIVES[case]
     with pytest.raises(era.InputError, match=message):
         playable_layers(drive, RIG)
-
-
-@pytest.mark.parametrize(
-    ("level", "phase_deg", "message"),
-    [(1.000000002, 0.0, "level.* got 1.000000002"), (1.0, math.inf, "phase.* got inf")],
-)
-def test_drive_refuses_a_level_or_phase(level: float, phase_deg: float, message: str) -> None:
-    """A level above 1, and a phase that is not finite."""
-    with pytest.raises(era.InputError, match=message):
-        era.Drive(110, level=level, phase_deg=phase_deg)
-
-
-@pytest.mark.parametrize(
-    "positions", [(0.1,), (0.1, 0.2, 0.3), "SW", [(0.1, 0.2), (0.3,)], 0.1, None], ids=str
-)
-def test_position_must_be_two_coordinates(positions: Sequence[object] | object) -> None:
-    """The error names the argument."""
-    with pytest.raises(era.InputError, match="target"):
-        as_points(positions, what="target")  # type: ignore[arg-type]

@@ -78,18 +78,6 @@ def installation(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_replaced_package_is_named(installation: Path) -> None:
-    """If another distribution was installed into the same folder later."""
-    file = installation / "model" / "__init__.py"
-    write_module(file, distribution="other")
-
-    status, lines = errors_of(PROGRAM, installation)
-
-    assert status == 1
-    expected = f"{file} is another program's, by the distribution other,"
-    assert expected in lines[-1]
-
-
 def test_missing_package_is_named(installation: Path) -> None:
     """By its folder."""
     (installation / "sim" / "__init__.py").unlink()

@@ -15,7 +15,6 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_writing import change_rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-MAIN = {"main": {"url": "sim://"}}
 SHEET = era.Plate(length="12 in", width="9 in", thickness="1.5 mm", material="aluminium")
 CORNERS = {"SW": (0, 0), "SE": ("12 in", 0), "NE": ("12 in", "9 in"), "NW": (0, "9 in")}
 
@@ -61,17 +60,6 @@ def test_rig_by_its_keys_is_that_of_the_file_and_reads_back(path: Path, tmp_path
     assert era.load_rig(copy) == by_keys
     era.save_rig(by_file, copy)
     assert copy.read_text("utf-8") == path.read_text("utf-8")
-
-
-def test_rig_with_defaults_is_the_papers() -> None:
-    """Damping, loss factor, stroke, amplifier and channels have the values of the example."""
-    wired = {}
-    for number, (name, at) in enumerate(CORNERS.items()):
-        wired[name] = era.Era(at=at, stiffness=17e3, amplifier="main", channel=number)
-
-    example = era.load_rig(EXAMPLES / "paper_plate.yaml")
-    assert example == RIG
-    assert era.rig(SHEET, wired, amplifiers=MAIN) == example
 
 
 def test_rig_from_keys_has_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,23 +144,6 @@ def test_keys_of_the_plate_and_of_single_eras_are_changed() -> None:
     assert [corner.stiffness for corner in unchanged] == [17e3, 17e3]
 
 
-def test_era_is_added() -> None:
-    """By the keys of a new name."""
-    with_three = change_rig(RIG, eras={"NW": None})
-    corner = era.Era(at=(0, "9 in"), stiffness=18e3, amplifier="main", channel=3)
-
-    with_four = change_rig(with_three, eras={"NW": corner})
-
-    assert [corner.name for corner in with_four.eras] == ["SW", "SE", "NE", "NW"]
-    assert with_four.eras[3].stiffness == 18e3
-
-
-def test_fingertip_is_removed_by_a_word() -> None:
-    """`none`; None changes nothing."""
-    assert change_rig(RIG, fingertip=None) == RIG
-    assert change_rig(RIG, fingertip="none").fingertip is None
-
-
 def test_deviations_of_modes_are_kept_if_the_modes_do_not_change() -> None:
     """Or are removed by None."""
     without = change_rig(WITH_MODES, thickness="2 mm", modes=None)
@@ -210,14 +181,6 @@ def test_errors_name_all_wrong_keys(name: str) -> None:
 
     for sentence in sentences:
         assert sentence in str(error.value)
-
-
-def test_amplifier_of_an_era_must_be_listed() -> None:
-    """The error names its key."""
-    wired = era.Era(at=(0, 0), stiffness=17e3, amplifier="main", channel=0)
-
-    with pytest.raises(era.InputError, match=r"eras\.SW\.amplifier: unknown"):
-        era.rig(SHEET, {"SW": wired}, amplifiers={})
 
 
 @pytest.mark.parametrize(
@@ -273,11 +236,3 @@ def test_playback_needs_the_target_of_a_drive(plate: era.SolvedPlate, answer: er
         plate.play(answer, quiet=[(0.15, 0.11)])
     with pytest.raises(era.InputError, match="target must be"):
         plate.play(answer, loads=[1])
-
-
-def test_answer_without_a_layer_has_no_map(plate: era.SolvedPlate, answer: era.Answer) -> None:
-    """Silence is not drawn."""
-    silent = replace(answer, contents=replace(answer.contents, streams=()))
-
-    with pytest.raises(era.InputError, match="must have a layer"):
-        plate.map(silent)

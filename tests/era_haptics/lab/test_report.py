@@ -106,25 +106,6 @@ def test_report_states_what_it_hides(
     assert daemon == {"rig": "rig.yaml", **expected}
 
 
-@pytest.mark.parametrize(
-    ("url", "expected"),
-    [
-        ("sim://", "sim://"),
-        ("serial:///dev/ttyUSB0?baud=921600", "serial:///dev/ttyUSB0?baud=921600"),
-        ("serial:///dev/serial/by-id/usb-A17?baud=9600", "serial://hidden?baud=9600"),
-        ("modbus+tcp://plc.example/7", "modbus+tcp://hidden"),
-        ("can+socketcan://can0#7", "can+socketcan://hidden#7"),
-        ("serial+tcp://me:1@amp:4001?pin=1", "serial+tcp://hidden"),
-        ("ftp://amp/x?baud=1", "hidden"),
-    ],
-)
-def test_report_shows_the_kind_of_a_line(tmp_path: Path, url: str, expected: str) -> None:
-    """Scheme, usual device, options and number of a valid URL, without host, user or path."""
-    rig = shown(tmp_path, "rig.yaml", RIG.replace("sim://", url))
-
-    assert rig["amplifiers"]["main"]["url"] == expected
-
-
 def test_report_gives_a_name_one_replacement_in_all_files(tmp_path: Path) -> None:
     """An amplifier of the rig, and of an ERA, is the same in the daemon's file and its log."""
     (tmp_path / "rig.yaml").write_text(re.sub(r"\bmain\b", "left-panel", RIG), "utf-8")
@@ -156,14 +137,6 @@ def test_record_is_shown_in_the_programs_own_words(name: str) -> None:
     line = json.dumps(RECORDS[name]["record"])
 
     assert json.loads(harmless_records(line, Names())) == RECORDS[name]["shown"]
-
-
-@pytest.mark.parametrize(
-    "line", ["swordfish", '{"message": "swordf', "[" * 5000, "\0", '{"a": 1} swordfish']
-)
-def test_line_that_is_no_record_is_hidden(line: str) -> None:
-    """Like the first of a long log, which is cut off, or the output of a library."""
-    assert harmless_records(line, Names()) == '"hidden: a line that is not a record"\n'
 
 
 # Files

@@ -31,7 +31,7 @@ from controller.sources.touch import Contact, ContactKey
 from era_haptics.command import run_era
 from era_haptics.lab.checks import joint_touches, layout_check
 from era_haptics.lab.checks.checked_effect import CheckedEffect
-from era_haptics.lab.checks.joint_touches import JointTouch, check_together, close_pairs
+from era_haptics.lab.checks.joint_touches import check_together
 from era_haptics.lab.checks.layout_check import check_layout
 from era_haptics.lab.cli import app
 from kit.fingers import WIRES, Pressed, playable
@@ -107,22 +107,6 @@ def test_check_reports_the_level_that_the_plate_makes_felt(
     assert expected - 0.5 <= touch.felt_db_sl <= expected + 2.0
 
 
-def test_check_reports_by_how_much_a_level_is_out_of_reach() -> None:
-    """10 dB above the level at full stroke, 10 dB are missing."""
-    region = replace(button(), band=(90.0, 110.0))
-    highest = math.floor(max(checked(region, Click(level=60.0)).felt))
-    assert highest < 59
-
-    effect_check = checked(region, Click(level=highest + 10.0))
-
-    (problem,) = effect_check.problems
-    missing = float(problem.split("up to ")[1].split(" dB")[0])
-    assert missing == pytest.approx(highest + 10.0 - min(effect_check.felt), abs=0.06)
-    assert 9.0 <= missing <= 13.0
-    assert effect_check.frequencies == [100.0]
-    assert "100 % of the region (1.4 cm²)" in problem
-
-
 def test_check_touches_the_part_of_a_region_that_is_on_the_plate() -> None:
     """A region of 40 mm by 12 mm, half of it beyond the east edge."""
     length = table().plate.length
@@ -133,16 +117,6 @@ def test_check_touches_the_part_of_a_region_that_is_on_the_plate() -> None:
     assert {touch.reason for touch in touches} == {None}
     columns = [touch.at[0] for touch in touches]
     assert length - 0.02 < min(columns) < max(columns) < length
-
-
-def test_check_reports_a_region_beyond_the_plate() -> None:
-    """It has no touches."""
-    rectangle = Rectangle(table().plate.length + 0.02, 0.04, 0.04, 0.012)
-
-    effect_check = checked(Region("beyond", rectangle, on_press="it"), Buzz())
-
-    assert effect_check.touches == ()
-    assert len(effect_check.problems) == 1
 
 
 @pytest.mark.parametrize(
@@ -245,19 +219,6 @@ def test_command_reports_an_effect_that_falls_short(tmp_path: Path) -> None:
     assert pair["promised_worst_db"] <= min(pair["promised_contrast_db"])
     assert set(pair["promised_verdicts"]) <= {"own", "mixed", "shared", "held back"}
     assert len(pair["at_m"]) == 2
-
-
-def test_command_prints_a_row_for_each_region(tmp_path: Path) -> None:
-    """With a band for the strip, the exit status is 0."""
-    text = LAYOUT.replace("notches}\n", "notches, band: [130, 190]}\n")
-
-    status, output = run_check(tmp_path, text)
-
-    assert status == 0
-    assert "strip, on_move: notches, 20 dB SL" in output
-    (row,) = [line.split() for line in output.splitlines() if line.startswith(" 2 strip")]
-    assert float(row[2]) > 0
-    assert row[3] == "-"
 
 
 @pytest.mark.parametrize("kind", sorted(set(config_kinds()) - {"layout", "rig"}))
@@ -377,21 +338,6 @@ def buzzes(*regions: Region) -> SurfaceLayout:
     """Return a layout of regions with a buzz each."""
     effects = {region.name: Buzz(level=14.0) for region in regions}
     return SurfaceLayout(regions, effects, elsewhere=None)
-
-
-def test_pairs_that_are_felt_as_one_are_named() -> None:
-    """Those below 6 dB, the lowest first; no groups of three."""
-    contrasts = {"ab": 3.2, "ac": 6.0, "bc": -1.0, "abc": -5.0}
-    places = ((0.0, 0.0), (0.0, 0.0))
-    touches = []
-    for names, contrast in contrasts.items():
-        touches.append(JointTouch((*names,), places, (contrast, contrast), contrast, ()))
-
-    sentence = close_pairs(touches)
-
-    assert "2 of 3 pairs" in sentence
-    assert sentence.index("b with c -1.0 dB") < sentence.index("a with b 3.2 dB")
-    assert close_pairs(touches[1:2]) == ""
 
 
 @pytest.mark.parametrize("requirement", ["is_own", "is_protected"])

@@ -12,10 +12,9 @@ from drivers.protocol.sets import Command, LayerSet, pack_layers
 from era_haptics.lab.conformance.check import ConformanceCheck
 from era_haptics.lab.conformance.checks import state_checks
 from era_haptics.lab.conformance.conformance_report import CheckResult, ConformanceReport, Result
-from era_haptics.lab.conformance.contract import CHECKS, of_kind
+from era_haptics.lab.conformance.contract import CHECKS
 from era_haptics.lab.conformance.judge import Judge
 from era_haptics.lab.conformance.outcomes import ContractViolation
-from era_haptics.lab.conformance.set_text import set_text
 from era_haptics.lab.expectations.tolerances import Interval
 from sim.amplifier.readings import capabilities
 
@@ -101,17 +100,6 @@ def test_levels_along_a_ramp_are_those_of_the_page(moment: float, level: float) 
 # Reports
 
 
-def test_violation_states_the_expected_and_the_actual_value() -> None:
-    """Nothing is `none`."""
-    violation = ContractViolation("latch", expected=3, actual=4)
-
-    assert str(violation) == "latch must be 3, got 4"
-    assert violation.actual == "latch: 4"
-    for empty in ("", set[int](), b""):
-        violation = ContractViolation("reply", expected=empty, actual=0)
-        assert str(violation) == "reply must be none, got 0"
-
-
 def failed_with(check: ConformanceCheck, reason: str) -> CheckResult:
     """Return a check that failed for a reason."""
     return CheckResult(check, 1, Result.FAILED, reason)
@@ -166,18 +154,6 @@ def test_failure_has_the_remedy_of_the_violated_rule() -> None:
     assert watchdog.to_json()["remedy"] == remedy
 
 
-def test_set_is_printed_in_words() -> None:
-    """The first set of the page, and its words in hexadecimal."""
-    words = "2A17 0102 0002 0004 0014 01F4 0008 0898 07D0 0000 0018 0898 044C DCD8 "
-    words += "0028 0898 0258 34BC 0038 0898 0190 0802"
-
-    text = set_text([[int(word, 16) for word in words.split()]])
-
-    assert text.startswith("set 258, staged; layer 0, ramp 20 ms, valid for 500 ms: channel 0 ")
-    assert "channel 0 110 Hz 0.2 at 0 degrees keep_phase, channel 1 110 Hz 0.11 at -90" in text
-    assert text.endswith(f"= {words}")
-
-
 # Checks
 
 
@@ -195,21 +171,3 @@ def test_check_has_a_title_a_remedy_and_a_rule(check: ConformanceCheck) -> None:
     assert len(check.title) <= 90
     assert check.remedy.endswith(".")
     assert anchor in anchors
-
-
-def test_checks_that_only_read_come_first() -> None:
-    """Each has a name of its own."""
-    names = [check.name for check in CHECKS]
-    drives = [check.drives for check in CHECKS]
-
-    assert len(set(names)) == len(names)
-    assert drives == sorted(drives)
-
-
-def test_page_on_writing_an_amplifier_counts_all_checks_of_a_serial_line() -> None:
-    """In the output that it shows."""
-    page = (DOCS / "how-to" / "write-an-amplifier.md").read_text("utf-8")
-
-    ((passed, skipped),) = re.findall(r"^(\d+) passed, 0 failed, (\d+) skipped", page, re.MULTILINE)
-
-    assert int(passed) + int(skipped) == len(of_kind("serial"))

@@ -23,7 +23,6 @@ from era_haptics.lab.design.problem import (
     anywhere,
     area_of,
     candidates_of,
-    contact_rule,
     everywhere,
     layouts_of,
     shortfall,
@@ -155,36 +154,6 @@ def test_refused_design_leaves_no_folder(
 
 
 # Contacts
-
-LAYOUT = """\
-quiet: [2, 2]
-apart: 4 cm
-elsewhere: null
-regions:
-  a: {rectangle: {start: [0, 0], end: [5 cm, 5 cm]}, on_press: click}
-  b: {circle: {at: [20 cm, 10 cm], radius: 4 cm}}
-"""
-
-
-def gaps_between(points: FloatArray) -> FloatArray:
-    """Return the distances of all pairs of points [m]."""
-    distances = np.linalg.norm(points[:, None] - points, axis=-1)
-    return np.asarray(distances[np.triu_indices(len(points), 1)])
-
-
-def test_contacts_are_in_the_regions_of_a_layout(tmp_path: Path) -> None:
-    """Three fingers, 4 cm apart; effects do not matter."""
-    path = tmp_path / "layout.yaml"
-    path.write_text(LAYOUT)
-
-    rule = contact_rule(path, PLATE)
-
-    for contacts in (*rule.sets(20, seed=1), *rule.pooled_sets(10, seed=1)):
-        assert len(contacts) == 3
-        in_rectangle = np.all(contacts <= 0.05, axis=1)
-        in_circle = np.linalg.norm(contacts - [0.2, 0.1], axis=1) <= 0.04
-        np.testing.assert_array_equal(in_rectangle | in_circle, True, err_msg=str(contacts))
-        assert gaps_between(contacts).min() > 0.04
 
 
 # Scores and a dense solve
@@ -354,18 +323,6 @@ def test_score_of_two_contents_is_that_of_the_worse(is_reversed: bool) -> None:
 # Rules for ERAs
 
 
-def test_kept_eras_stay_and_all_keep_their_distance() -> None:
-    """A random start is exchanged and moved, 8 cm apart along the edge."""
-    search = LayoutSearch(problem(kept=("SW", "NE"), apart=0.08))
-
-    positions = search.from_random(np.random.default_rng(2)).positions
-
-    assert positions[:2].tolist() == [[0, 0], [PLATE.length, PLATE.width]]
-    assert gaps_between(positions).min() >= 0.08
-    is_at_edge = area_of("edge", PLATE).contains(positions)
-    np.testing.assert_array_equal(is_at_edge, True)
-
-
 def test_static_loads_of_a_seesaw() -> None:
     """Three ERAs at two corners and the middle of the far side carry a quarter, a quarter, half.
 
@@ -396,33 +353,3 @@ def test_area_without_room_is_refused() -> None:
         problem(apart=0.3).random_layout(np.random.default_rng(0))
     with pytest.raises(InputError, match=r"^where must"):
         candidates_of(nowhere, count=20)
-
-
-def test_new_eras_are_like_the_first_that_is_not_kept() -> None:
-    """With names that no kept ERA has."""
-    first = replace(RIG.eras[0], name="E1", stroke=5e-5)
-    rig = replace(RIG, eras=(first, *RIG.eras[1:]))
-
-    eras = problem(rig=rig, kept=("E1",)).eras(np.zeros((3, 2)))
-
-    strokes = {new.name: new.stroke for new in eras}
-    assert strokes == {"E1": 5e-5, "E2": 1e-4, "E3": 1e-4}
-
-
-def test_random_layouts_are_different(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of four corners and nothing between them three can be chosen in four ways."""
-    monkeypatch.setitem(problem_module.CANDIDATES, True, 4)
-    design_problem = problem(count=3, apart=0.1)
-
-    layouts = layouts_of("random:100", design_problem)
-
-    choices = set()
-    for triple in combinations(design_problem.candidates.tolist(), 3):
-        if design_problem.are_apart(np.array(triple)):
-            choices.add(frozenset(map(tuple, triple)))
-    random_layouts = []
-    for name, places in layouts.items():
-        if name.startswith("3-"):
-            random_layouts.append(frozenset(map(tuple, places.tolist())))
-    assert len(set(random_layouts)) == len(random_layouts) <= len(choices)
-    assert set(random_layouts) <= choices

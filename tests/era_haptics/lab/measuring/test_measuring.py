@@ -5,7 +5,6 @@ The plate on the desk is in memory, simulated from a seed, and compared with the
 
 import ctypes
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +18,8 @@ from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
 from era_haptics.lab.measuring.multisine import (
     Multisine,
-    ResponseEstimate,
-    estimate,
     multisine_frequencies,
 )
-from era_haptics.lab.measuring.recording_checks import check_wiring
 from era_haptics.lab.measuring.runs import play_and_record
 from era_haptics.lab.measuring.sensor_file import WiredSensor
 from era_haptics.lab.measuring.sound_card import SoundCard
@@ -116,21 +112,6 @@ def test_multisine_has_its_level_and_orthogonal_runs() -> None:
     for line in (41, 251, 499):
         matrix = spectra[:, line] / np.abs(spectra[:, line])
         np.testing.assert_allclose(matrix @ matrix.conj().T, 5 * np.eye(5), atol=1e-6)
-
-
-def test_estimate_uses_all_rounds_of_runs() -> None:
-    """Two rounds give the gains of a wire; a single period is refused."""
-    multisine = Multisine(np.array([61.0, 151.0]), 3, 1000.0, level=0.1)
-    gains = np.array([[1.0, -2.0, 0.5], [0.0, 3.0, -1.0]])
-    recordings = []
-    for run in range(6):
-        recordings.append(multisine.signal(run, periods=4)[1000:3000] @ gains.T)
-
-    values = estimate(multisine, recordings).values
-
-    np.testing.assert_allclose(values, [gains, gains], atol=1e-9)
-    with pytest.raises(InputError, match="at least 2 periods, got 1"):
-        estimate(multisine, [recording[:1000] for recording in recordings])
 
 
 def test_recording_needs_the_whole_signal() -> None:
@@ -307,64 +288,6 @@ def test_wrong_desk_is_refused_with_its_cause(rig: Rig, truth: Truth, name: str)
 
     with pytest.raises(error, match=cause):
         measure(Desk(rig, SENSORS), card_of(truth, **wires), MULTISINE)  # type: ignore[arg-type]
-
-
-def test_noise_as_loud_as_the_signal_is_refused(rig: Rig, truth: Truth) -> None:
-    """Without clipping."""
-    soft = replace(MULTISINE, level=0.03)
-
-    with pytest.raises(LinkError, match="coherence"):
-        measure(Desk(rig, SENSORS), card_of(truth, noise=1.5), soft)
-
-
-def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
-    """An actuator without gain behind output 3, with the noise of any sensor."""
-    first, second, third, fourth = truth.actuators
-    actuators = (first, second, replace(third, gain=0.0), fourth)
-    card = card_of(replace(truth, actuators=actuators), noise=5e-3)
-
-    with pytest.raises(LinkError, match=r"output 3.*NE"):
-        measure(Desk(rig, SENSORS), card, MULTISINE)
-
-
-GAINS = np.array([[0.02, 0.03, 0.02, 0.03, 0.0]] * 3 + [[0.0, 0.0, 0.0, 0.0, 0.9]])
-"""Of P1, P2, P3 and the loop-back by outputs 1 to 5; output 5 has the cable."""
-WIRINGS: dict[str, tuple[int, list[float], str | None]] = {
-    "no cable": (4, [0, 0, 0, 0, 0], "output 5 alone, as the loop-back, got a gain of 0; connect"),
-    "another output in the loop-back": (
-        4,
-        [0, 0.03, 0, 0, 0.9],
-        "got 0.03 of output 2 of ERA SE, too; check mixers",
-    ),
-    "1 % of crosstalk between cables": (4, [0, 0.01, 0, 0, 0.9], None),
-    "swapped": (4, [0, 0.9, 0, 0, 0], "got 0.9 of output 2 of ERA SE: outputs are swapped"),
-    "cable at the input of a sensor": (
-        2,
-        [0, 0, 0, 0, 0.3],
-        "input 2 must have sensor P2, got output 5 as through a cable",
-    ),
-    "output at the input of a sensor": (
-        3,
-        [0, 0.8, 0, 0, 0],
-        "input 3 must have sensor P3, got output 2 as through a cable",
-    ),
-    "monitoring at a sensor": (3, [0.02, 0.03, 0.02, 0.03, 0.3], None),
-}
-"""An input, its gains, and the error."""
-
-
-@pytest.mark.parametrize("name", WIRINGS)
-def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(rig: Rig, name: str) -> None:
-    """The gains of an input show by hand what is connected to it."""
-    input_number, gains, cause = WIRINGS[name]
-    of_inputs = GAINS.copy()
-    of_inputs[input_number - 1] = gains
-    by_frequency = np.tile(of_inputs, (len(FREQUENCIES), 1, 1)).astype(complex)
-    sizes = np.abs(by_frequency)
-    responses = ResponseEstimate(by_frequency, sizes, sizes, np.zeros(4))
-
-    with nullcontext() if cause is None else pytest.raises(InputError, match=cause):
-        check_wiring(responses, Desk(rig, SENSORS).wiring)
 
 
 # The device

@@ -111,20 +111,6 @@ def test_measurement_ends_with_its_server(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.real_time
-@pytest.mark.needs("jackd", "portaudio")
-def test_amplifier_rejects_a_rate_without_whole_milliseconds() -> None:
-    """44.1 kHz of a server; a measurement takes any rate."""
-    name = f"rate{os.getpid()}"
-    with jack_server(name, rate=44_100) as server:
-        Capture(name, "looking", 1).close()  # once the server is up
-        status, message = rejected(server, "soft-amp", "--device", "system", "--channels", "2")
-
-    assert status == 2
-    assert "multiple of 1000 Hz" in message
-    assert "44100 Hz" in message
-
-
 # Fixed sensors
 
 PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20), (0.11, 0.19), (0.25, 0.03))
@@ -340,15 +326,6 @@ def test_stopped_measurement_is_resumed(make_bench: MakeBench, ending: str) -> N
     assert {row.sensor for row in read_measured(bench.output)} == set(THREE_PLACES)
 
 
-def test_measurement_that_was_not_started_is_not_resumed(make_bench: MakeBench) -> None:
-    """There is no file."""
-    bench = make_bench()
-
-    assert bench.measure("--resume") == 2
-
-    assert "to go on from" in bench.errors
-
-
 @pytest.mark.parametrize(
     ("options", "cause"),
     [
@@ -365,28 +342,6 @@ def test_measurement_with_other_options_is_not_resumed(
     bench.measure(keys=[""])
 
     assert bench.measure("--resume", *options) == 2
-
-    assert re.search(cause, bench.errors)
-
-
-@pytest.mark.parametrize(
-    ("file", "old", "new", "cause"),
-    [
-        ("sensors.csv", "0.03,", "0.04,", "places"),
-        ("rig.yaml", "factor: 0.01", "factor: 0.02", "sensor 5 g, rig .* got level 0.3"),
-    ],
-)
-def test_measurement_with_other_files_is_not_resumed(
-    make_bench: MakeBench, file: str, old: str, new: str, cause: str
-) -> None:
-    """Another place and rig."""
-    bench = make_bench()
-    bench.measure(keys=[""])
-    text = Path(file).read_text("utf-8")
-    assert old in text
-    Path(file).write_text(text.replace(old, new), "utf-8")
-
-    assert bench.measure("--resume") == 2
 
     assert re.search(cause, bench.errors)
 
@@ -426,27 +381,6 @@ def test_sensor_that_was_not_moved_is_noticed(make_bench: MakeBench) -> None:
     assert places["measured"] == ["P1", "P2", "P3"]
     assert bench.errors.count("not kept") == 1
     assert "the sensor is still there; move it to P2" in bench.errors
-
-
-@pytest.mark.parametrize(
-    ("muted", "places", "message"),
-    [
-        (5, ["P1"], "P2 is not kept: output 1 is not heard here"),
-        (0, [], "P1 is not kept: output 1 moves not"),
-    ],
-    ids=["second place", "first place"],
-)
-def test_output_that_was_heard_elsewhere_is_not_called_dead(
-    make_bench: MakeBench, muted: int, places: list[str], message: str
-) -> None:
-    """Silent from the second place on, it may be on a nodal line, which s skips."""
-    bench = make_bench()
-    bench.card.muted = muted
-
-    assert bench.places(keys=["", *[""] * len(places)])["measured"] == places
-
-    assert message in bench.errors
-    assert ("; s skips it" in bench.errors) == bool(places)
 
 
 @pytest.mark.parametrize(

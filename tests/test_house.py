@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from changed_tests import ALSO, also
-from checks import english, vocabulary
-from checks.vocabulary import retired_identifiers
+from checks import english
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("tests", "docs", "examples", "firmware")
@@ -51,21 +50,6 @@ def test_rows_name_what_there_is() -> None:
     assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
 
 
-def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An example, and a program on a page at its line there; text beside programs is free."""
-    files = {
-        "examples/one.py": "begin = 1\n",
-        "README.md": "begin = 0\n\n```python\nstart = 1\nbegin = start\n```\n",
-        "docs/how-to/two.md": "```python\nstart = 1\n```\n```\nbegin = 1\n```\n",
-    }
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text, "utf-8")
-    monkeypatch.setattr(vocabulary, "ROOT", tmp_path)
-    named = [message.partition(", use")[0] for message in retired_identifiers()]
-    assert named == ["examples/one.py:1: begin", "README.md:5: begin"]
-
-
 FOREIGN = {
     "README.md": "# Plate\n\nCode such as `what is` is free.\n\nIt plays what\nis asked.\n",
     "docs/how-to/page.md": "```\nat once\n```\n\n| key | all that plays |\n",
@@ -87,19 +71,6 @@ def stop() -> None:
 _logger.warning("as of %s", "what", "is")
 ''',
 }
-
-
-def test_british_spellings_are_found_except_in_keys_and_code(tmp_path: Path) -> None:
-    """In prose, help and errors of any budget; not in backticks, code and docstrings."""
-    (tmp_path / "README.md").write_text("Analyses of `centre` are modelled in grey.\n", "utf-8")
-    (tmp_path / "model").mkdir()
-    module = '"""Its centre."""\nraise InputError(f"the colour of {centre} is wrong")\n'
-    (tmp_path / "model" / "module.py").write_text(module, "utf-8")
-    prose = english.read(tmp_path, allowed=[])
-    settings: dict[str, Any] = {"budgets": {"default": 2.0, "docs": 6.0}, "exceptions": {}}
-    reported = [*english.over_budget(prose, settings)]
-    assert len(reported) == 3
-    assert reported[-1].startswith("model/module.py:2: British spelling")
 
 
 def test_foreign_sentences_are_found_at_their_lines(tmp_path: Path) -> None:

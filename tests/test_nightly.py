@@ -52,19 +52,3 @@ def test_nightly_lists_every_target_after_a_failed_and_a_hung_one(tmp_path: Path
     assert "## failing: failed\n\n    channel 2 plays\n" in page
     assert not is_running(int((tmp_path / "left_behind").read_text()))
     assert run.returncode == 1
-
-
-def test_nightly_reports_targets_for_which_no_time_is_left(tmp_path: Path) -> None:
-    """A run that is out of time ends with a failure, and says what it has not run."""
-    (tmp_path / "Makefile").write_text(MAKEFILE)
-
-    run = subprocess.run(
-        [sys.executable, PROGRAM, "passing", "--folder", tmp_path, "--hours", "0"],
-        capture_output=True,
-        text=True,
-    )
-
-    assert (
-        "| `passing` | not run: 0 hours were up |" in (tmp_path / "out/nightly/page.md").read_text()
-    )
-    assert run.returncode == 1

@@ -18,14 +18,13 @@ from controller.content.formats import Ahap, content_format, content_formats, re
 from controller.content.reading import ContentFormat
 from controller.effects.effect import Effect
 from controller.effects.kinds import Buzz, effect_kind, effect_kinds
-from controller.effects.layout import SurfaceLayout, load_layout
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.sources.touch import TOUCH_SOURCES, Contact, ContactKey, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.serial_line import SerialAddress
 from drivers.wires.wire import address_of
-from era_haptics.command import run_era
 from model.errors import InputError
 from model.structure.material import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import EXAMPLE_PREFIX, PluginRegistry, failure_text
@@ -176,11 +175,6 @@ of_every_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.gro
 made_of_urls = pytest.mark.parametrize(
     "kind", [kind for kind in KINDS if kind.ending], ids=lambda kind: kind.group
 )
-with_names_of_their_own = pytest.mark.parametrize(
-    "kind",
-    [kind for kind in KINDS if "'fine'" in kind.works],
-    ids=lambda kind: kind.group,
-)
 
 Install = Callable[..., str]
 """install(package, kind, name, source) -> the name of the plug-in's module."""
@@ -277,26 +271,6 @@ def test_plugin_that_fails_in_use_is_attributed_to_its_package(
     assert text.endswith("; repair or remove that package")
 
 
-def test_own_error_is_not_attributed_to_a_plugin(install: Install) -> None:
-    """An error with no plug-in's code in its traceback."""
-    install("bad", KINDS[0], "fine", "raise RuntimeError\n")
-    with pytest.raises(ZeroDivisionError) as caught:
-        1 / 0  # noqa: B018
-    assert failure_text(caught.value) == "ZeroDivisionError: division by zero"
-
-
-def test_command_attributes_the_failure_of_a_plugin(
-    install: Install, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Bad input (2), not a bug of this project (70)."""
-    kind = next(kind for kind in KINDS if kind.group == "wires")
-    module = install("bad", kind, "fine", kind.fails)
-    assert run_era(["amp", "stop", "fine://a:1"]) == 2
-    error = capsys.readouterr().err
-    assert f"plug-in {module}:THING of package bad" in error
-    assert "bug" not in error
-
-
 @of_every_kind
 def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Install) -> None:
     """Ours included; the error names the packages, and other names work."""
@@ -313,14 +287,6 @@ def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Instal
     assert kind.look_up("other")
 
 
-def test_layout_names_the_packages_that_claim_a_kind(install: Install, tmp_path: Path) -> None:
-    """Of an effect whose name is its kind, which needs none beside it."""
-    install("one", KINDS[1], "buzz", KINDS[1].works)
-    (layout := tmp_path / "layout.yaml").write_text("effects: {buzz: {}}\n", "utf-8")
-    with pytest.raises(InputError, match=r"effects\.buzz: kind of effect buzz is claimed by"):
-        load_layout(layout, None)
-
-
 @of_every_kind
 def test_example_name_cannot_collide_with_a_built_in_one(kind: Kind) -> None:
     """Names of example plug-ins have a prefix, which a registry rejects for names of its own."""
@@ -333,21 +299,6 @@ def test_example_name_cannot_collide_with_a_built_in_one(kind: Kind) -> None:
     for name in names:
         with pytest.raises(ValueError, match=rf"must not begin with 'example', got '{name}'"):
             PluginRegistry(kind.what, kind.group, object, error=InputError, own={name: object()})
-
-
-@of_every_kind
-def test_plugin_on_the_path_twice_is_one(kind: Kind, install: Install) -> None:
-    """The same object of the same module, as with an old folder left on the path."""
-    module = install("good", kind, "fine", kind.works)
-    install("left", kind, "fine", kind.works, module=module)
-    assert is_made_by(kind.look_up("fine"), sys.modules[module].THING)
-
-
-def test_installation_of_an_older_version_of_ours_is_no_other_package(install: Install) -> None:
-    """Whose entry points name what is now the project's own without one."""
-    (effects,) = (kind for kind in KINDS if kind.group == "effects")
-    install("era-haptics", effects, *effects.own[:1], effects.works)
-    assert effects.look_up(effects.own[0]) is effects.own[1]
 
 
 OWN_URLS = ("tuio:", "TUIO:4000", "evdev:/dev/input/event5"), ("sim://rig.yaml", "SIM://rig.yaml")
@@ -394,24 +345,6 @@ def test_unknown_name_suggests_a_known_one(kind: Kind, install: Install) -> None
     assert known.endswith(f"entry point in {group}, which is found once its package is installed")
     with pytest.raises(kind.error, match=f"'x{{40}}{ending}'; known: "):
         kind.look_up("x" * 500)
-
-
-@with_names_of_their_own
-def test_plugin_has_the_name_of_its_entry_point(kind: Kind, install: Install) -> None:
-    """Otherwise a table would have another name than the rig."""
-    install("good", kind, "finer", kind.works)
-    with pytest.raises(kind.error, match=r"of package good .*'fine'"):
-        kind.look_up("finer")
-
-
-def test_format_whose_ending_has_a_dot(install: Install, tmp_path: Path) -> None:
-    """Of `a.fine.json` the longest ending that is known counts, whatever its case."""
-    kind = next(kind for kind in KINDS if kind.group == "content_formats")
-    install("one", kind, "json", kind.works.replace("'fine'", "'json'"))
-    source = kind.works.replace("'fine'", "'fine.json'").replace("Format\n", "Format, Pattern\n", 1)
-    install("two", kind, "fine.json", source.replace("pass", "return Pattern(0.5)"))
-    (file := tmp_path / "a.FINE.json").write_text("")
-    assert read_content(file).duration == 0.5
 
 
 @made_of_urls

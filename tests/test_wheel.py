@@ -18,13 +18,13 @@ from pathlib import Path
 import pytest
 from packaging.tags import platform_tags
 
-from build_libraries import BuildError, Library, compile_library, tree_libraries, update
+from build_libraries import Library, tree_libraries, update
 from cases import shortly
 from licences import NOTES
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.compiled.versions import versions
 from packages import PACKAGES
-from smoke import lowest, requirements
+from smoke import requirements
 
 ROOT = Path(__file__).parents[1]
 LATER = 4_000_000_000  # s; a time of change after those of all files of the project
@@ -203,43 +203,6 @@ def test_library_is_compiled_if_its_sources_differ_from_those_it_was_compiled_of
     compiled = path.stat().st_ino
     update([library], tmp_path)
     assert path.stat().st_ino == compiled
-
-
-@pytest.mark.parametrize("compiler", ["/nowhere/cc", "false"])
-def test_compiler_that_fails_leaves_no_library(
-    compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error names the compiler."""
-    source = tmp_path / "seven.c"
-    source.write_text("int seven(void) { return 7; }")
-    monkeypatch.setenv("CC", compiler)
-    library = Library("seven.so", (source,), (), ())
-    with pytest.raises(BuildError, match=compiler):
-        update([library], tmp_path)
-    with pytest.raises(BuildError, match=compiler):
-        compile_library(library, tmp_path / "seven.so")
-    assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]
-
-
-@pytest.mark.long
-def test_sdist_holds_what_is_needed_to_test_and_document_it(sdist: Path) -> None:
-    """No caches and nothing built; tests, pages and examples are there."""
-    with tarfile.open(sdist) as archive:
-        names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"Makefile", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "LICENSE"} <= names
-    assert {"tests/test_wheel.py", "docs/conf.py", "examples/paper_plate.yaml"} <= names
-    unwanted = re.compile(r"(^|/)(_build|dist|out|\.venv|__pycache__|\.[a-z_]+_cache)(/|$)|\.pyc$")
-    assert [name for name in names if unwanted.search(name)] == []
-
-
-def test_every_dependency_has_a_bound_that_can_be_tried(wheel: Path) -> None:
-    """`make smoke-lowest` pins each to its bound; every one of the plain wheel has one."""
-    pinned = {line.partition("==")[0] for line in lowest(wheel).split()}
-    assert pinned == {
-        requirement.name
-        for requirement in requirements(wheel)
-        if requirement.marker is None or requirement.marker.evaluate({"extra": "gateway"})
-    }
 
 
 def test_licences_page_lists_every_dependency(wheel: Path) -> None:

@@ -24,17 +24,7 @@ from typer.testing import CliRunner
 
 import constraints
 import era_haptics
-import notebooks
-import pages
-from controller.api.methods import StateEvent
-from controller.api.schema import headline
 from controller.cli.config_cli import app as config_commands
-from controller.daemon.config import DaemonSection, LogSection, TouchSection
-from controller.operation.operation_states import DaemonState
-from drivers.by_hand.cli import amp
-from drivers.by_hand.links import check_links
-from drivers.errors import CommandError
-from drivers.protocol.definition import BOOT_TIME
 from drivers.wires.wire import address_of
 from era_haptics.command import command_modules, run_era
 from model.cli import app
@@ -42,35 +32,8 @@ from model.study import overview
 from packages import PACKAGES
 from processes.typed_page import Reader, difference, read_steps
 from registry.command_line import join_commands
-from registry.limits import GuardLimits
 
 ROOT = Path(__file__).parents[2]
-
-
-FOLDERS_WITH_GENERATED_FILES = (
-    ".",
-    "docs/reference",
-    "docs/how-to",
-    "controller/api",
-    "firmware/core",
-    "examples/javascript",
-)
-
-
-def test_every_file_marked_as_generated_has_a_generator() -> None:
-    """A mark, or the name of a generator in the first lines of a file."""
-    mark = re.compile(
-        r"<!-- begin: written by|\A.*\n?.*\n?.*(?:made|[Ww]ritten) by docs/generators"
-    )
-    marked = set()
-    for folder in FOLDERS_WITH_GENERATED_FILES:
-        for path in (ROOT / folder).glob("*.*"):
-            is_text = path.suffix in (".md", ".py", ".pyi", ".h", ".ts")
-            if is_text and mark.search(path.read_text("utf-8")):
-                marked.add(path.relative_to(ROOT).as_posix())
-
-    assert len(marked) > 6
-    assert marked - set(pages.WRITTEN) == set()
 
 
 def test_constraints_pin_every_dependency_within_its_bounds() -> None:
@@ -121,29 +84,6 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line[1:-1].split("|")] for line in table.splitlines()[2:]]
 
 
-def test_page_has_the_word_that_people_see_for_each_state() -> None:
-    """In the status, in the event of a change, and in a line unless the cause begins with it."""
-    words = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown as |")}
-
-    assert list(words) == [state.value for state in DaemonState]
-    for state, word in words.items():
-        event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None, epoch=1)
-        assert event.model_dump()["word"] == word
-        assert headline(state, event.cause) == f"{word}: a cable was cut"
-        assert headline(state, f"{word} by 'era'") == f"{word} by 'era'"
-
-
-def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
-    """The keys of the configuration's model, and no others; a section's keys in its row."""
-    table = rows("daemon.md", "| key | meaning | default |")
-    meanings = {row[0].strip("`"): row[1] for row in table}
-
-    assert sorted(meanings) == sorted(DaemonSection.model_fields)
-    for key, section in {"touch": TouchSection, "log": LogSection}.items():
-        (keys,) = re.findall(r"`\{(.*?)\}`", meanings[key])[:1]
-        assert keys.split(", ") == list(section.model_fields)
-
-
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
 RIG = str(ROOT / "examples" / "paper_plate.yaml")
 COARSE = ["--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9"]
@@ -181,23 +121,6 @@ def test_page_lists_every_command_with_its_options() -> None:
         referenced = re.findall(r"`(--[a-z-]+)", reference)
         assert set(referenced) - common == set(), name
         assert {*described, *referenced} == option_names(command), name
-
-
-def test_every_command_with_json_has_its_keys_in_the_table() -> None:
-    """A command that has the option `--json` is in the table of keys."""
-    table = PAGE.partition("## What `--json` prints")[2].partition("## All commands")[0]
-    first_cells = " ".join(re.findall(r"^\| (`era .*?) \|", table, re.MULTILINE))
-    sections = re.split(r"^### era ", PAGE, flags=re.MULTILINE)[1:]
-    with_json = [
-        section.splitlines()[0]
-        for section in sections
-        if re.search(r"[Aa]lso with .*`--json`", section)
-    ]
-
-    assert len(with_json) > 30
-    for name in with_json:
-        is_listed = f"`era {name}`" in first_cells or f"`{name.split()[-1]}`" in first_cells
-        assert is_listed, name
 
 
 @pytest.fixture(scope="module")
@@ -353,37 +276,6 @@ def test_example_url_is_the_amplifier_that_the_page_states(
     assert (address.line, address.number) == (line, int(number))
 
 
-def test_slowest_line_is_that_of_the_page() -> None:
-    """The check accepts it and rejects half of that speed."""
-    ((baud, kilobits),) = re.findall(r"at least (\d+) baud, or (\d+) kbit/s", URLS_PAGE)
-
-    def rejected_at(share: float) -> list[str]:
-        bauds, bitrate = int(share * int(baud)), int(share * 1000 * int(kilobits))
-        urls = {
-            "a": f"serial:///dev/a?baud={bauds}",
-            "b": f"modbus+rtu:///dev/b?baud={bauds}",
-            "c": f"can+slcan:///c?bitrate={bitrate}",
-        }
-        errors, _ = check_links(urls, channels={}, limits=GuardLimits(40.0, 250.0, 1.0))
-        return [*errors]
-
-    assert rejected_at(1) == []
-    assert rejected_at(0.5) == ["a", "b", "c"]
-
-
-def test_page_has_every_scheme_and_the_time_of_a_board() -> None:
-    """The schemes that the error for an unknown scheme lists, in the first table and the help."""
-    with pytest.raises(CommandError) as error:
-        address_of("carrier+pigeon://roof")
-    schemes = set(re.findall(r"([\w+-]+)://[,;\s]", f"{error.value} ")) - {"carrier+pigeon"}
-    schemes_on_page = set(re.findall(r"^\| `([\w+-]+)://", URLS_PAGE, re.MULTILINE))
-    schemes_in_help = set(re.findall(r"^  ([\w+-]+)://", str(amp.info.epilog), re.MULTILINE))
-
-    assert schemes_on_page == schemes, "run make pages"
-    assert schemes_in_help == schemes, "run make pages"
-    assert f"for {BOOT_TIME:g} s" in URLS_PAGE
-
-
 def test_every_page_can_be_found() -> None:
     """Each page is in the side bar, or a page of figures or pictures there links to it."""
     docs = ROOT / "docs"
@@ -473,37 +365,3 @@ def test_python_examples_print_the_output_of_the_page(
     doctest.DocTestRunner().run(test, out=printed.append)
     assert len(test.examples) > 25
     assert "".join(printed) == ""
-
-
-NOTEBOOK = '''# %% [markdown]
-"""
-# A title
-"""
-
-# %%
-from matplotlib.figure import Figure
-print("seen")
-
-# %%
-Figure()
-'''
-
-
-def test_notebook_becomes_a_page_with_its_output_and_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Text as text, a cell with its output, and a figure that ends a cell as a picture."""
-    monkeypatch.setattr(notebooks, "ROOT", tmp_path)
-    pictures = tmp_path / "docs"
-    pictures.mkdir()
-    (tmp_path / "small.py").write_text(NOTEBOOK, "utf-8")
-
-    page = notebooks.as_markdown(tmp_path / "small.py", pictures)
-
-    title, code, output, figure, picture = page.split("\n\n")
-    assert title == "# A title"
-    assert 'print("seen")' in code
-    assert output == "````text\nseen\n````"
-    assert "Figure()" in figure
-    assert picture == "![The figure of this cell](/small-2.png)"
-    assert (pictures / "small-2.png").read_bytes().startswith(b"\x89PNG")

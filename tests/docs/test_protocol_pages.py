@@ -18,21 +18,12 @@ from drivers.playing import Playback
 from drivers.protocol.definition import (
     COMMAND,
     ENVELOPE,
-    EVENT,
     EVENT_RECORD,
-    FAULTS,
-    FEATURES,
-    HELLO,
     IDENTITY,
     KNOT,
     LAYER,
     MESSAGES,
-    NAK,
     NAK_RECORD,
-    QUANTITIES,
-    REFUSALS,
-    STATES,
-    STATUS_FLAGS,
 )
 from drivers.protocol.records import Record
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -161,14 +152,6 @@ def test_amplifier_serves_the_objects_of_the_eds(eds: canopen.ObjectDictionary) 
             value = objects.read(index, subindex, 0.0)
             if variable.data_type != canopen.objectdictionary.VISIBLE_STRING:
                 assert len(value) == len(variable) // 8, (hex(index), subindex)
-
-
-def test_limit_of_the_eds_has_the_value_of_the_amplifier(eds: canopen.ObjectDictionary) -> None:
-    """The largest level of channel 3 is 1, in steps of 0.0001."""
-    objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
-    number = list(eds[0x2001].names).index("limits 3 level_max")
-
-    assert int.from_bytes(objects.read(0x2001, number, 0.0), "little") == 10000
 
 
 PAGE = (DOCS / "protocol.md").read_text("utf-8")
@@ -389,20 +372,6 @@ def test_set_is_packed_from_the_data_alone() -> None:
     assert f"> {frame.hex(' ').upper()}" == page_frames("serial", "Set, part 1 of 2")[0]
 
 
-def test_status_is_packed_from_the_data_alone() -> None:
-    """The words of protocol.md, which further readings follow."""
-    status = {"state": SHEET["states"]["OPERATION_ENABLED"], "fault": 0, "flags": 1, "latch": 0}
-    status |= {"watchdog_left": 250, "temperature": 250, "high_voltage": 1800}
-    status |= {"clock": 0x60000000, "token": 0x0102, "channels": 4, "layers": 8}
-    columns = {"levels": [3300, 3200, 0, 0], "tokens": [0x0102, 0x0102, 0, 0x0101, 0, 0, 0, 0]}
-    reply = SHEET["messages"]["GetStatus"]["reply"]
-    first_fields = [field for field in reply if not field.get("added")]
-
-    words = packed(first_fields, {**status, **columns})
-
-    assert words == words_of_page()["Status"][: len(words)]
-
-
 @pytest.mark.parametrize("name", RECORDS)
 def test_every_record_is_read_as_the_data_pack_it(name: str) -> None:
     """Requests, replies, Events, Naks and parts of them, with values anywhere in their ranges."""
@@ -411,90 +380,6 @@ def test_every_record_is_read_as_the_data_pack_it(name: str) -> None:
     for _ in range(20):
         values = drawn(fields, rng)
         assert record.unpack(packed(fields, values), is_strict=True) == values
-
-
-def test_data_list_every_message() -> None:
-    """With its number, and whether it feeds the watchdog and can be broadcast."""
-    numbers = {"Hello": HELLO, "Event": EVENT, "Nak": NAK}
-    numbers |= {name: message.number for name, message in MESSAGES.items()}
-
-    assert {name: entry["number"] for name, entry in SHEET["messages"].items()} == numbers
-    for name, message in MESSAGES.items():
-        entry = SHEET["messages"][name]
-        assert (entry["feeds"], entry["broadcast"]) == (message.feeds, message.is_broadcast), name
-
-
-def test_data_list_every_quantity() -> None:
-    """With its type, unit and scale."""
-    assert SHEET["quantities"].keys() == QUANTITIES.keys()
-    for name, quantity in QUANTITIES.items():
-        entry = SHEET["quantities"][name]
-        assert (entry["type"], entry["unit"]) == (quantity.wire, quantity.unit), name
-        for integer in (quantity.minimum, quantity.maximum):
-            value = (integer - entry["zero"]) / entry["per_unit"]
-            assert value == pytest.approx(quantity.from_wire(integer)), name
-
-
-@pytest.mark.parametrize(
-    ("name", "table"),
-    [
-        ("states", STATES),
-        ("faults", FAULTS),
-        ("codes", REFUSALS),
-        ("features", FEATURES),
-        ("status_flags", STATUS_FLAGS),
-    ],
-)
-def test_data_list_every_name_of_a_table(name: str, table: object) -> None:
-    """States, faults, codes, features and flags."""
-    assert SHEET[name] == json.loads(json.dumps(table))
-
-
-def test_check_of_serial_frames_follows_from_its_parameters() -> None:
-    """Bit by bit as the parameters say, against zlib and the value that the sheet states."""
-    crc = SHEET["serial"]["crc"]
-    assert crc["reflected"]
-    polynomial = int(f"{crc['polynomial']:0{crc['width']}b}"[::-1], 2)
-    register = crc["initial"]
-    for byte in b"123456789":
-        register ^= byte
-        for _ in range(8):
-            register = register >> 1 ^ (polynomial if register & 1 else 0)
-    assert register ^ crc["xor"] == crc["check"] == zlib.crc32(b"123456789")
-
-
-def test_messages_have_the_registers_of_their_number() -> None:
-    """Requests begin at 0x100 times the number, replies 0x80 after."""
-    for name, registers in SHEET["modbus"]["registers"].items():
-        number = SHEET["messages"][name]["number"]
-        expected = {"written_from": 0x100 * number, "reply_from": 0x100 * number + 0x80}
-        assert registers == expected, name
-
-
-def test_commit_of_the_page_has_the_written_layout() -> None:
-    """Address, count, bytes and registers: a tag before the words of the request."""
-    frame = bytes.fromhex("0600 0004 08 0001 2A17 0102 6000")
-    (address,) = struct.unpack_from(">H", frame)
-    tag, *words = struct.unpack_from(">4H", frame, 5)
-
-    request = MESSAGES["Commit"].request.unpack(words, is_strict=True)
-
-    assert SHEET["modbus"]["layout"]["written"] == ["tag", "words of the request"]
-    assert address == SHEET["modbus"]["registers"]["Commit"]["written_from"]
-    assert tag == 1
-    assert request == {"session": 0x2A17, "token": 0x0102, "at": 0x6000}
-
-
-def test_reply_of_the_page_has_the_layout_of_replies() -> None:
-    """Tag and result before the words of the reply."""
-    tag, result, *words = struct.unpack(">5H", bytes.fromhex("0002 0000 0102 0006 0000"))
-
-    taken = MESSAGES["Set"].reply.unpack(words, is_strict=False)
-
-    layout = [part.partition(":")[0] for part in SHEET["modbus"]["layout"]["reply"]]
-    assert layout == ["tag", "result", "words of the reply", "zeros"]
-    assert (tag, result) == (2, 0)
-    assert (taken["token"], taken["staged"], taken["played"]) == (0x0102, 1, 0)
 
 
 def test_each_read_of_the_status_object_is_a_new_status() -> None:

@@ -95,11 +95,6 @@ def test_page_quotes_status_and_remedy(quoted: Quotation) -> None:
     assert REMEDY.search(quoted.text)
 
 
-def test_page_quotes_every_case_that_is_shown() -> None:
-    """Each shown case has a box of its own."""
-    assert sorted(tuple(quoted.typed) for quoted in QUOTED) == sorted(SHOWN)
-
-
 WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
         "model.table.table_file.solve_table"

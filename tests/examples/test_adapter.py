@@ -3,7 +3,6 @@
 import asyncio
 import os
 import re
-import runpy
 import signal
 import sys
 from collections import deque
@@ -327,39 +326,3 @@ async def test_instrument_that_reports_an_error_is_switched_off() -> None:
             await failing(group, layer(0.3))
         await state(host, "FAULT")
         assert instrument.is_silent
-
-
-class Quiet:
-    """A device that does at once what it is told."""
-
-    channels = 1
-
-    def __init__(self) -> None:
-        self.is_silent = asyncio.Event()
-
-    def play(self, channel: int, tone: object) -> None:
-        """Note nothing."""
-
-    async def send(self) -> None:
-        """Send nothing."""
-
-    async def silence(self) -> None:
-        """Be silent."""
-        self.is_silent.set()
-
-
-@pytest.mark.parametrize("turns", range(5))
-async def test_adapter_ends_although_a_request_comes_at_the_same_moment(turns: int) -> None:
-    """However many turns of the event loop lie between the request and the end."""
-    adapter = runpy.run_path(str(SCRIPT.with_name("adapter.py")))["Adapter"]
-    device = Quiet()
-    first_adapter = adapter("a", device, lambda sign: None)
-    running = asyncio.ensure_future(first_adapter.run())
-    await device.is_silent.wait()
-    await asyncio.sleep(0.01)
-    first_adapter._receive(b"")
-    for _ in range(turns):
-        await asyncio.sleep(0)
-    running.cancel()
-    await asyncio.wait([running], timeout=PATIENCE / 20)
-    assert running.cancelled()

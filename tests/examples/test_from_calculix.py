@@ -2,7 +2,6 @@
 
 import math
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from examples.calculix.from_calculix import convert, read_set
 from model.arrays import FloatArray
 from model.rig.rig_file import load_rig
 
-PROGRAM = Path(__file__).parents[2] / "examples" / "calculix" / "from_calculix.py"
 COUNT = 9
 """Nodes in three rows of three, numbered from 0."""
 SHAPES = np.ones((2, 9, 3))
@@ -154,28 +152,10 @@ def test_convert_refuses_numbers_of_another_kind(
     check_refusal(model, message)
 
 
-def test_convert_refuses_modes_of_two_steps(tmp_path: Path) -> None:
-    """They would be those of two plates."""
-    model = write_model(tmp_path, [*RESULTS, *result_lines(SHAPES, step=2)])
-    check_refusal(model, "modes must come from one *FREQUENCY step, got steps 1, 2")
-
-
-def test_convert_refuses_a_static_analysis(tmp_path: Path) -> None:
-    """It has no modes."""
-    model = write_model(tmp_path, result_lines(SHAPES, analysis=0))
-    check_refusal(model, "model.frd: must contain modes, got none")
-
-
 def test_convert_refuses_a_file_that_ends_early(tmp_path: Path) -> None:
     """As after a run that was interrupted."""
     model = write_model(tmp_path, RESULTS[:-3])
     check_refusal(model, "block must end with -3, got the end of the file")
-
-
-def test_convert_refuses_a_mode_without_a_touched_node(tmp_path: Path) -> None:
-    """The fourth line of the results has node 1."""
-    model = write_model(tmp_path, RESULTS[:4] + RESULTS[5:])
-    check_refusal(model, "mode must have all 3 nodes of TOUCH, got 2 without node 1")
 
 
 @pytest.mark.parametrize(
@@ -202,28 +182,6 @@ def test_convert_refuses_an_unclear_node_set(touch: str, message: str, tmp_path:
     model = write_model(tmp_path, RESULTS, touch)
 
     check_refusal(model, message)
-
-
-@pytest.mark.parametrize(
-    ("touch", "message"),
-    [
-        ("*INCLUDE, INPUT=gone.inp\n", "gone.inp: No such file or directory"),
-        ("*NSET, NSET=FACE\n1\n", "must have the node set TOUCH, got FACE"),
-    ],
-    ids=["no included file", "no set"],
-)
-def test_program_ends_with_one_sentence(touch: str, message: str, tmp_path: Path) -> None:
-    """And with status 1, in place of a traceback."""
-    model = write_model(tmp_path, RESULTS, touch)
-
-    program = subprocess.run(
-        [sys.executable, PROGRAM, model], capture_output=True, text=True, check=False
-    )
-
-    assert program.returncode == 1
-    assert program.stderr.startswith("from_calculix: ")
-    assert message in program.stderr
-    assert program.stderr.count("\n") == 1
 
 
 LENGTH = 0.4

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.link import default_socket
 from processes.daemons import (
     ENABLED,
     PATIENCE,
@@ -65,33 +64,6 @@ async def ended(process: asyncio.subprocess.Process) -> tuple[int | None, str, s
     """Its exit status and both outputs."""
     out, err = await asyncio.wait_for(process.communicate(), PATIENCE)
     return process.returncode, out.decode(), err.decode()
-
-
-@pytest.mark.parametrize(
-    "environment",
-    [
-        {},
-        {"XDG_RUNTIME_DIR": "/run/somewhere"},
-        {"XDG_RUNTIME_DIR": "/run/somewhere", "ERA_HAPTICS_SOCKET": "own.sock"},
-    ],
-    ids=["none", "runtime folder", "own socket"],
-)
-def test_javascript_client_finds_the_socket_that_the_commands_find(
-    environment: dict[str, str],
-) -> None:
-    """The socket of `era status`, also on machines without a runtime folder of the user."""
-    client = ROOT / "examples" / "javascript" / "era_client.mjs"
-    program = f"import({json.dumps(str(client))}).then(m => console.log(m.defaultSocket()))"
-    node = installed_program("node", "nodejs", package="nodejs")
-    process = subprocess.run(
-        [node, "-e", program],
-        env={"PATH": os.environ["PATH"], **environment},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    expected = default_socket({"PATH": os.environ["PATH"], **environment})
-    assert process.stdout.strip() == str(expected)
 
 
 @pytest.mark.real_time

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from drivers import opening
-from drivers.errors import CommandError, LinkError
+from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
@@ -91,12 +91,3 @@ async def read_for_ever(amplifier: Any) -> None:
     """Read the status until an error."""
     while True:
         await amplifier.read_status()
-
-
-async def test_url_and_socket_must_be_there(address: Any, tmp_path: Path) -> None:
-    """An address that cannot be, a path that is none."""
-    for url in ("example-unix://host/x", "example-unix:///x#300", "example-unix:///", "x:///y?z"):
-        with pytest.raises(CommandError):
-            address(url)
-    with pytest.raises(LinkError, match="no connection"):
-        await Lines().amplifier(f"example-unix://{tmp_path / 'none'}", LIMITS, name="a")

@@ -17,7 +17,6 @@ import httpx
 import pytest
 
 from controller.api.client import AsyncClient
-from controller.play.selected_contents import GIVEN_UP
 from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
 from kills import PLACES as KILLED_AT
@@ -33,7 +32,6 @@ from processes.daemons import (
     armed,
     daemon_process,
     disarmed,
-    energised,
     far_end,
     holding,
     loudness,
@@ -45,77 +43,8 @@ from processes.daemons import (
     silent_from,
     until,
     until_state,
-    write_daemon,
 )
 from sim.faults import FaultWindow
-
-
-@pytest.mark.real_time
-async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
-    """In a library that looks at no signal, as one that waits for memory."""
-    stuck = (
-        "import ctypes, controller.daemon.daemon as daemon\nfrom era_haptics.command import main\n"
-        "def table(config):\n"
-        "    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)\n"
-        "    print(flush=True)\n"
-        "    lock(mutex), lock(mutex)\n"
-        "daemon.prepared_table = table\nmain()"
-    )
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-c", stuck, "daemon", write_daemon(tmp_path, {"main": "sim://"})),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.DEVNULL,
-    )
-    assert await asyncio.wait_for(process.stdout.readline(), PATIENCE)
-    process.terminate()
-    try:
-        assert await asyncio.wait_for(process.wait(), PATIENCE) == -signal.SIGTERM
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-
-
-TWO_HALVES = """
-regions:
-  west: {rectangle: {start: [0 m, 0 m], end: [0.15 m, 0.2 m]}, on_press: buzz}
-  east: {rectangle: {start: [0.15 m, 0 m], end: [0.3 m, 0.2 m]}, on_press: buzz}
-"""
-WEST, EAST = (0.08, 0.1), (0.22, 0.1)
-
-
-@pytest.mark.real_time
-async def test_daemon_ends_while_an_answer_hangs(tmp_path: Path) -> None:
-    """It has said so at both fingers by then, and one of them feels its own without an answer."""
-    hangs = (
-        "import runpy, threading\nfrom controller.play.chooser import Chooser\n"
-        "choose = Chooser.choose\n"
-        "def hang(chooser, requested, *more):\n"
-        "    requested.takes_long and threading.Event().wait()\n"
-        "    return choose(chooser, requested, *more)\n"
-        f"Chooser.choose = hang\nrunpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
-    )
-    (tmp_path / "layout.yaml").write_text(TWO_HALVES, "utf-8")
-    # Fingers that this machine is too busy to repeat in time would land again, and be asked again.
-    program = (sys.executable, "-c", hangs, "--resting")
-    async with (
-        far_end(tmp_path, is_patient=True) as far,
-        daemon_process(tmp_path, far, "layouts: {panel: layout.yaml}\n", program=program) as daemon,
-        await daemon.client() as era,
-    ):
-        await armed(era)
-        async with holding(era, WEST, EAST), asyncio.timeout(PATIENCE):
-            reasons = set[str | None]()
-            while reasons != {GIVEN_UP}:
-                await asyncio.sleep(0.05)
-                status = await era.status()
-                reasons = {contact.held_back for contact in status.contacts}
-        async with holding(era, WEST, far=far):
-            pass
-        async with holding(era, WEST, EAST):
-            await asyncio.sleep(0.1)
-            daemon.process.terminate()
-            assert await daemon.status() == 0
-        assert not energised(far)
 
 
 @pytest.mark.real_time

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from cases import shortly
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.effects.layout import LAYOUT, load_layout
@@ -225,36 +224,6 @@ def is_brighter_at(index: int, fingers: list[list[list[int]]]) -> bool:
     return len(brightness) == 2 and brightness[index] > brightness[1 - index]
 
 
-async def test_shift_and_click_leaves_fingers_resting(page: Page, era: Client) -> None:
-    """Beside a pointer that presses; each until it is clicked so again, or Escape lifts all."""
-    (first, second, third) = await on_plate(page, (0.3, 0.4), (0.7, 0.6), (0.5, 0.8))
-    for place in (first, second):
-        for kind in ("mousePressed", "mouseReleased"):
-            await page.mouse(kind, *place, shift=True)
-    await contacts(era, 2)
-    await page.mouse("mousePressed", *third)
-    assert (await contacts(era, 3))[-1] == pytest.approx((0.5 * LENGTH, 0.2 * WIDTH), abs=1e-3)
-    await page.mouse("mouseReleased", *third)
-    await contacts(era, 2)
-    await page.mouse("mousePressed", *first, shift=True)
-    await page.mouse("mouseReleased", *first, shift=True)
-    assert await contacts(era, 1) == [pytest.approx((0.7 * LENGTH, 0.4 * WIDTH), abs=1e-3)]
-    await page.press("Escape")
-    assert await contacts(era, 0) == []
-
-
-async def test_summary_explains_silence_while_disarmed(page: Page, era: Client) -> None:
-    """While a finger is down, with the remedy for the current state."""
-    summary = "document.querySelector('#summary').textContent"
-    async with fingers_down(page, PLACES[0]):
-        disarmed = await page.until(summary)
-        era.stop()
-        stopped = await page.until(summary, lambda text: text not in ("", disarmed))
-        assert " clear" not in disarmed
-        assert " clear" in stopped
-    await page.until(f"{summary} === ''")
-
-
 async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) -> None:
     """Two at once, at their places in meters, moved and lifted; the last one is the target."""
     await arm(page, era)
@@ -397,21 +366,6 @@ async def test_space_bar_stops_with_any_focus(fresh: Page, era: Client) -> None:
         await settled(fresh, era)
 
 
-@pytest.mark.parametrize("is_dark", shortly([False, True], [True]))
-async def test_text_has_enough_contrast(page: Page, era: Client, is_dark: bool) -> None:
-    """By the formula of WCAG 2.2 at least 4.5 to 1, in both schemes, ready, armed and stopped."""
-    await page.dark(is_dark)
-    looked = 0
-    for click, state in ((None, READY), ("#arm", ENABLED), ("#stop", STOPPED)):
-        if click:
-            await page.click(click)
-        await page.until(f"{STATE} === '{state}'")
-        ratios = await page.evaluate(f"({PROBES}).contrasts()")
-        looked += len(ratios)
-        assert [ratio for ratio in ratios if ratio[0] < 4.5] == []
-    assert looked > 60
-
-
 async def test_elements_have_roles_names_and_tab_order(fresh: Page) -> None:
     """For screen readers and the keyboard."""
     await fresh.until(
@@ -516,31 +470,6 @@ async def test_effect_button_always_finds_a_finger_of_its_page(page: Page, era: 
     (finger,) = await contacts(era, 1)
     assert math.dist(finger, pressed) < 0.001
     await contacts(era, 0)
-
-
-async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
-    """One that was closed with it has no red frame; its levels are unknown, too.
-
-    Of readings those are shown that are known, with their unit, and below 10 with their decimals.
-    """
-    labels = await page.evaluate(
-        "import('./side.js').then(({ showAmplifiers }) => {"
-        " const unknown = { state: null, fault: null, levels: [], high_voltage: null,"
-        "  reply_age_s: 1 };"
-        " const tiles = document.createElement('div');"
-        " showAmplifiers(tiles, ["
-        "  { ...unknown, name: 'left', lost: true, closed_with_lost: false, fan: 72.04 },"
-        "  { ...unknown, name: 'right', lost: false, closed_with_lost: true, fan: null }],"
-        "  [], { fan: ['Fan', 'rpm', 1] });"
-        " return [...tiles.children].map((tile) => [tile.className,"
-        "  ...[...tile.querySelectorAll('h3 span, p, dd')].map((each) => each.textContent)]);"
-        "})"
-    )
-    unknown = ("channels: unknown", "unknown")
-    assert labels == [
-        ["tile bad", "left", "no link", *unknown, "72 rpm", "1 s ago"],
-        ["tile", "right", "closed: another amplifier is lost", *unknown, "1 s ago"],
-    ]
 
 
 async def test_login_needs_the_token(tab: Page, gateway: GatewayProcess, era: Client) -> None:

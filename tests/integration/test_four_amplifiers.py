@@ -15,15 +15,12 @@ import pytest
 
 import model
 from cases import in_turn, shortly
-from drivers.errors import LinkError
 from drivers.host.group_states import GroupState
 from kit.chain import Chain
 from kit.clock import in_virtual_time
 from kit.host_rules import HostTimes
 from kit.set_table import SetTable
-from kit.wires import WIRES
 from model.fem import Mesh
-from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.vibration import Tone
 from sim.far_ends.wire_assignment import SimulatedWire
@@ -127,23 +124,3 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
         four.far.devices[lost].recover()
         await holding
         assert max(levels_of_all(four)) == 0
-
-
-@pytest.mark.parametrize("of_rig", [False, True])
-@pytest.mark.parametrize("of_amplifier", [False, True])
-@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "can+slcan"]))
-@in_virtual_time
-async def test_motion_and_output_are_not_taken_for_each_other(
-    wire: str, of_amplifier: bool, of_rig: bool, coarse_rig: Rig
-) -> None:
-    """An amplifier opens where its full level is the rig's."""
-    rigs = {False: coarse_rig, True: replace(coarse_rig, outputs=frozenset(coarse_rig.amplifiers))}
-    rig = rigs[of_rig]
-    table = SetTable({}, rig.plate)
-    async with Chain.on(WIRES[wire], rig, table, plate=rigs[of_amplifier]) as chain:
-        if of_amplifier is of_rig:
-            await chain.controller.open()
-        else:
-            with pytest.raises(LinkError, match="full level must be"):
-                await chain.controller.open()
-        await chain.controller.close()

@@ -13,7 +13,6 @@ from cases import shortly
 from controller.api.client import AsyncClient
 from controller.api.schema import ContactStatus
 from controller.demo.demonstration import Scene, example_scenes, run_demo
-from controller.effects.layout import load_layout
 from controller.sources.tuio_capture import read_capture
 from kit.clock import run_virtual
 from kit.fingers import write_schedule
@@ -149,18 +148,3 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
     for row in rows:
         assert row.steady
         assert row.as_json()["fingers"]
-
-
-@pytest.mark.parametrize("name", CHANNELS_OF)
-def test_layout_lies_on_its_plate(name: str) -> None:
-    """Every control is where a finger can be, and no control covers the middle of another."""
-    plate = load_rig(EXAMPLES / f"{name}.yaml").plate
-    regions = load_layout(EXAMPLES / f"{name}_layout.yaml", plate).regions
-    assert len(regions) >= 6
-    for region in regions:
-        x, y = region.shape.center
-        assert 0 < x < plate.length
-        assert 0 < y < plate.width
-        assert [candidate.name for candidate in regions if candidate.shape.contains(x, y)] == [
-            region.name
-        ]

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from benchmarks.latency.session import daemon_session, plain_session, taps
+from benchmarks.latency.session import daemon_session, taps
 
 COUNT, PLANTED = 10, 0.08  # s
 
@@ -23,13 +23,3 @@ async def test_time_of_every_touch_holds_a_delay_of_the_daemon(is_two: bool) -> 
     assert measured.unanswered == 0
     assert measured.times.min() > PLANTED
     assert measured.times.min() > measured.wire > 0
-
-
-@pytest.mark.long
-@pytest.mark.alone
-async def test_baseline_answers_every_touch() -> None:
-    """Plain asyncio, which computes nothing, on the same line."""
-    async with plain_session("paper_plate") as session:
-        measured = await taps(session, COUNT)
-    assert measured.unanswered == 0
-    assert 0 < measured.times.min() < measured.times.max()

@@ -1,7 +1,6 @@
 """Standard streams: what steers a terminal is escaped, and closed ones do no harm."""
 
 import io
-import os
 import re
 import shlex
 import subprocess
@@ -12,7 +11,7 @@ import pytest
 
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path
-from registry.streams import PrintableStream, drawing_on, printable
+from registry.streams import PrintableStream, printable
 
 ERA = shlex.quote(str(Path(sys.executable).with_name("era")))
 RIG = shlex.quote(str(example_rig_path()))
@@ -91,23 +90,3 @@ def test_closed_streams_keep_their_numbers(tmp_path: Path) -> None:
     result = typed(f'{shlex.quote(sys.executable)} -c "{program}" <&- >&- 2>&-', tmp_path)
     assert result.returncode == 0
     assert (tmp_path / "data").read_bytes() == b""
-
-
-def test_command_says_that_its_output_cannot_be_written(tmp_path: Path) -> None:
-    """A standard output that is open for reading alone is named, and is no bug."""
-    result = typed(f"{ERA} plate modes {RIG} --json 1</dev/null", tmp_path)
-    assert result.returncode == 2
-    assert re.fullmatch(rb"era: error: standard output cannot be written;[^\n]*\n", result.stderr)
-
-
-def test_library_draws_on_a_protected_stream(tmp_path: Path) -> None:
-    """Bars of progress need control characters; they come behind what was printed before."""
-    path = tmp_path / "terminal"
-    with path.open("wb") as file:
-        stream = PrintableStream(os.fdopen(os.dup(file.fileno()), "wb"), "utf-8")
-        stream.write("before\x1b ")
-        drawing = drawing_on(stream)
-        drawing.write("\x1b[2K")
-        drawing.flush()
-        stream.close()
-    assert path.read_bytes() == b"before\\x1b \x1b[2K"

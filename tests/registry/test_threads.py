@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Awaitable
-from itertools import islice
 
 import pytest
 
@@ -16,7 +15,6 @@ from registry.threads import (
     DaemonThreads,
     in_thread,
     no_long_collections,
-    pauses,
     without_collections,
 )
 
@@ -79,30 +77,6 @@ async def test_awaiter_gets_an_error_when_work_tries_to_end_the_program(
         await asyncio.wait_for(work, timeout=10)
 
 
-THREAD_THAT_WAITS = """
-import _thread
-from registry.threads import DaemonThreads, are_at_work
-
-starts = []
-_thread.start_new_thread = lambda *start: starts.append(start)
-DaemonThreads().submit(int)
-print("submitted:", are_at_work())
-((function, arguments),) = starts
-function(*arguments)
-print("run:", are_at_work())
-"""
-
-
-def test_work_counts_before_its_thread_runs() -> None:
-    """Also if the scheduler has not run the thread yet when the program ends.
-
-    In a process of its own, because threads of other tests count, too.
-    """
-    run = subprocess.run([sys.executable, "-c", THREAD_THAT_WAITS], capture_output=True, text=True)
-
-    assert run.stdout.splitlines() == ["submitted: True", "run: False"], run.stderr
-
-
 @pytest.mark.parametrize(
     "start",
     [
@@ -131,11 +105,6 @@ async def main():
 asyncio.run(main())
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
-
-
-def test_pauses_grow_up_to_a_limit() -> None:
-    """Each twice the one before: 0.1, 0.2, ... 5 s."""
-    assert list(islice(pauses(), 8)) == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0])
 
 
 def test_backoff_resets_after_a_good_minute() -> None:
@@ -191,10 +160,3 @@ def test_did_you_mean_suggests_similar_names(
 ) -> None:
     """Mistyped names, another case and one word of a name are understood."""
     assert did_you_mean(name, choices) == suggestion
-
-
-def test_did_you_mean_ignores_a_common_ending() -> None:
-    """`usb://` is more similar to `sim://` than `usb` to `sim`."""
-    assert did_you_mean("usb", ["sim"], ending="://") == ""
-    assert did_you_mean("usb://", ["sim://"]) != ""
-    assert did_you_mean("sym", ["sim"], ending="://") == "did you mean sim://? "

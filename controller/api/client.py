@@ -65,6 +65,7 @@ from controller.api.methods import (
     EffectsResult,
     HelloResult,
     LayoutResult,
+    PlayResult,
     ReloadResult,
     RenewResult,
     StatusResult,
@@ -79,6 +80,7 @@ from model.errors import InputError
 from registry.threads import LoopThread, pauses
 
 MAX_QUEUED_EVENTS = 1000  # waiting to be read; the oldest is dropped
+_TOUCH_INTERVAL = 0.05  # s; a finger counts as lifted 150 ms after its last report
 _REPEATED_FOR = 0.3  # s; of requests that lose their connection, as happens with many clients
 
 _T = TypeVar("_T")
@@ -268,11 +270,12 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
         level_db_sl: float | None = None,
         taps: Sequence[tuple[float, float, float]] = (),
         loop: bool = False,
-    ) -> None:
-        """Play an effect at the finger nearest to x, y [m]; the status reports what it feels.
+    ) -> PlayResult:
+        """Play an effect at the finger nearest to x, y [m]; return the outcome.
 
-        effect: its name, or points of a continuous event: time [s], intensity and sharpness, 0 to
-        1. taps: transients, in the same format.
+        Returns once the amplifiers have confirmed the start, usually within some milliseconds, or
+        the effect is late or held back. effect: its name, or points of a continuous event: time
+        [s], intensity and sharpness, 0 to 1. taps: transients, in the same format.
         """
         x, y = as_position(position)
         params: dict[str, Any] = {"x_m": x, "y_m": y, "level_db_sl": level_db_sl, "loop": loop}
@@ -281,7 +284,33 @@ class AsyncClient(AbstractAsyncContextManager["AsyncClient"]):
             params["effect"] = effect
         else:
             params["points"] = [*map(list, effect)]
-        await self._call(Empty, "play", **params)
+        return await self._call(PlayResult, "play", **params)
+
+    @asynccontextmanager
+    async def resting(
+        self, positions: Sequence[tuple[float, float]], *, source: str = "python"
+    ) -> AsyncIterator[None]:
+        """Keep all fingers of a source down for the duration of a `with` block, at x, y [m].
+
+        They also rest while the plate is disarmed or stopped, and after a lost connection.
+        """
+        params = make_params("touch", source=source, touches=touches_at(positions))
+        await self.request("touch", params)
+        repeating = asyncio.create_task(self._repeat_touch(params), name="resting fingers")
+        try:
+            yield
+        finally:
+            repeating.cancel()
+            lifted = make_params("touch", source=source, touches=[])
+            with suppress(RpcError, Unreachable):
+                await self.request("touch", lifted)
+
+    async def _repeat_touch(self, params: ApiMessage) -> None:
+        """Report the same fingers until cancelled or closed."""
+        while not self._is_closed:
+            await asyncio.sleep(_TOUCH_INTERVAL)
+            with suppress(RpcError, Unreachable):
+                await self.request("touch", params)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Subscribe to topics; see `events`."""
@@ -591,11 +620,31 @@ class Client(AbstractContextManager["Client"]):
 
         Once the lease is lost, the next call and the end of the block raise LeaseLost.
         """
-        armed = self._client.armed(owner, lease_s=lease_s)
-        with ExitStack() as end:
-            lease = self._run(armed.__aenter__())
-            end.push(lambda *error: self._run(armed.__aexit__(*error)))
+        with self._entered(self._client.armed(owner, lease_s=lease_s)) as lease:
             yield lease
+
+    @contextmanager
+    def resting(
+        self, positions: Sequence[tuple[float, float]], *, source: str = "python"
+    ) -> Iterator[None]:
+        """Keep all fingers of a source down for the duration of a `with` block, at x, y [m].
+
+        They also rest while the plate is disarmed or stopped, and after a lost connection.
+        """
+        with self._entered(self._client.resting(positions, source=source)):
+            yield
+
+    @contextmanager
+    def _entered(self, context: AbstractAsyncContextManager[_T]) -> Iterator[_T]:
+        """Enter a context of the asynchronous client for the duration of a `with` block."""
+        with ExitStack() as end:
+            value = self._run(context.__aenter__())
+            end.push(lambda *error: self._run(context.__aexit__(*error)))
+            yield value
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for a time [s], which is virtual in a simulated panel."""
+        self._run(asyncio.sleep(seconds))
 
     def events(self, *, timeout: float | None = None) -> Iterator[Notification]:
         """Yield notifications as they arrive; end when none arrives within a timeout [s]."""

@@ -13,6 +13,7 @@ from controller.api.schema import (
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
+    PROMISED,
     STATE_WORDS,
     AmplifierSilence,
     AmplifierStatus,
@@ -233,6 +234,46 @@ class PlayParams(ApiMessage):
     """whether points or a file repeat from the start"""
 
 
+class OtherFinger(ApiMessage):
+    """Another finger on the plate, and the vibrations of others that reach it."""
+
+    source: str
+    id: int
+    x_m: float
+    y_m: float
+    foreign_level_db_sl: float | None
+    """as in the status: not exceeded on 90 % of plates, relative to the most sensitive published
+    thresholds; null if unknown or without vibrations of others"""
+    rig_foreign_level_db_sl: float | None
+    """the same level relative to the rig's threshold set"""
+
+
+class PlayResult(ApiMessage):
+    """Outcome of a request to play, once the amplifiers have confirmed it or it was given up."""
+
+    outcome: Literal["played", "late", "held back", "pending"]
+    """played: confirmed by the amplifiers; late: it was over, or had lost its touch, before they
+    could play it; held back: not played, for a reason; pending: not yet, because it begins with a
+    pause, waits for a movement, or was not decided within 2 s"""
+    reason: str | None = None
+    """why it is not played, or why the finger shares another vibration; null otherwise"""
+    start_s: float | None = None
+    """when the amplifiers start it, on CLOCK_MONOTONIC; the following values are null if it is not
+    played"""
+    frequency_hz: float | None = None
+    """null if it has several frequencies"""
+    level_db_sl: float | None = None
+    """predicted level on the nominal plate, relative to the rig's threshold set; over the duration
+    of a short vibration, onset included"""
+    promised_level_db_sl: float | None = None
+    """level that 90 % of plates within the rig's tolerances reach"""
+    promised_contrast_db: float | None = Field(None, description=PROMISED)
+    verdict: Literal["own", "mixed", "shared"] | None = None
+    """as in the status"""
+    other_fingers: list[OtherFinger] = Field([])
+    """all other fingers, in order of arrival"""
+
+
 class StrengthParams(ApiMessage):
     """A touch source, client or region and its gain; without a gain, nothing changes."""
 
@@ -421,7 +462,7 @@ METHODS: dict[str, Method] = {
     "layout": Method(LayoutParams, LayoutResult),
     "reload": Method(Empty, ReloadResult),
     "effects": Method(Empty, EffectsResult),
-    "play": Method(PlayParams, Empty, is_repeated=False),
+    "play": Method(PlayParams, PlayResult, is_repeated=False),
     "strength": Method(StrengthParams, StrengthResult),
     "subscribe": Method(SubscribeParams, Empty, over_http=False),
     "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),

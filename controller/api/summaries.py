@@ -17,7 +17,7 @@ SUMMARIES = {
     "layout": "Switch to another of the daemon's layouts. Continuous effects under resting fingers change immediately. Effects of limited duration, and effects that a program plays, continue to their end.",
     "reload": "Read the daemon's files again and apply their layouts. All other changes are rejected; they need a restart.",
     "effects": "List the available effects.",
-    "play": "Play an effect, or points and taps, at a finger; only while armed.",
+    "play": "Play an effect, or points and taps, at a finger; only while armed. Returns the outcome: when it starts and at which level, or why it is not played.",
     "strength": "Set or show the strength of a source, client or region. The status shows all strengths. Active effects fade to the new strength within 100 ms.",
     "subscribe": "Subscribe to notifications of topics.",
     "unsubscribe": "Unsubscribe from notifications of topics.",

@@ -23,6 +23,7 @@ from controller.api.methods import (
     LayoutParams,
     LayoutResult,
     PlayParams,
+    PlayResult,
     ReloadResult,
     RenewParams,
     RenewResult,
@@ -41,6 +42,7 @@ from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import EventPublisher, effects_result, hello_result
 from controller.daemon.plate_view import playing_of
+from controller.daemon.play_outcomes import PlayOutcomes
 from controller.daemon.requested_effect import requested_effect
 from controller.effects.effect import Effect
 from controller.operation.operation_states import (
@@ -101,6 +103,7 @@ class ApiService:
         self._strengths = layouts.player.strengths
         self._saving: asyncio.Task[None] | None = None
         self._save_problem = ""  # error of the last attempt
+        self._outcomes = PlayOutcomes(supervisor, layouts.player, publisher.view)
         self._preparing = asyncio.Lock()  # held while an effect that a client plays is prepared
 
     def handlers(self) -> Mapping[str, Handler]:
@@ -297,8 +300,11 @@ class ApiService:
         """List the available effects."""
         return effects_result(self._layouts.player.layout)
 
-    async def play(self, client: Connection, params: PlayParams) -> Empty:
-        """Play an effect, or points and taps, at a finger; only while armed."""
+    async def play(self, client: Connection, params: PlayParams) -> PlayResult:
+        """Play an effect, or points and taps, at a finger; only while armed.
+
+        Returns the outcome: when it starts and at which level, or why it is not played.
+        """
         # At the contact nearest to the position, at most at the effect's own level.
         requested = requested_effect(params, self._layouts.player.layout)
         effect = requested.effect
@@ -315,7 +321,7 @@ class ApiService:
                 raise RpcError(
                     ErrorCode.WRONG_STATE, "stopped or disarmed meanwhile", remedy="play it again"
                 )
-        self._layouts.player.play(
+        play = self._layouts.player.play(
             requested.name,
             contact,
             threads.now(),
@@ -324,7 +330,7 @@ class ApiService:
             effect=effect,
         )
         self._controller.cycle.request_update()
-        return Empty()
+        return await self._outcomes.wait_for(play, contact)
 
     async def _prepared(self, effect: Effect, level: float | None) -> Effect:
         """Return a copy of an effect, rendered in a thread for a level [dB SL] or its own."""

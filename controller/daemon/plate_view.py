@@ -61,7 +61,7 @@ class PlateView:
         leaks = leaks_db_sl(table, contents, self.contacts)
         current_statuses = []
         for status, contact in zip(statuses, self.contacts, strict=True):
-            leak = {"leak_db_sl": _finite(leaks[contact.key])}
+            leak = {"leak_db_sl": finite(leaks[contact.key])}
             current_statuses.append(status.model_copy(update=leak))
         return current_statuses
 
@@ -152,8 +152,8 @@ def _sensation_of(contact: Contact, report: PlayReport) -> dict[str, object]:
             highest = max(levels, default=None)
             rig_level = levels[0] if levels else None
             figures["role"] = "quiet"
-            figures["foreign_level_db_sl"] = _finite(highest)
-            figures["rig_foreign_level_db_sl"] = _finite(rig_level)
+            figures["foreign_level_db_sl"] = finite(highest)
+            figures["rig_foreign_level_db_sl"] = finite(rig_level)
             figures["is_foreign_felt"] = is_felt(highest)
     return figures
 
@@ -163,13 +163,13 @@ def _figures(target: FingerSensation) -> dict[str, object]:
     sensation = target.sensation
     return {
         "feels": target.content_name,
-        "level_db_sl": _finite(target.level_db_sl),
-        "promised_contrast_db": _finite(sensation.promised_contrast_db),
-        "contrast_db": _finite(sensation.contrast_db),
+        "level_db_sl": finite(target.level_db_sl),
+        "promised_contrast_db": finite(sensation.promised_contrast_db),
+        "contrast_db": finite(sensation.contrast_db),
         "verdict": sensation.verdict,
         "frequency_hz": target.frequency,
-        "foreign_level_db_sl": _finite(sensation.foreign_level_db_sl),
-        "rig_foreign_level_db_sl": _finite(sensation.rig_foreign_level_db_sl),
+        "foreign_level_db_sl": finite(sensation.foreign_level_db_sl),
+        "rig_foreign_level_db_sl": finite(sensation.rig_foreign_level_db_sl),
         "is_foreign_felt": sensation.is_foreign_felt,
         "held_back": target.held_back,
     }
@@ -191,9 +191,9 @@ def playing_of(applied: PlayReport | None) -> dict[str, Any]:
         playing["layers"][str(number)] = _played_tones(slot.drive)
     if applied.felt is not None:
         sensation = applied.felt.sensation
-        playing["promised_contrast_db"] = _finite(sensation.promised_contrast_db)
-        playing["predicted_contrast_db"] = _finite(sensation.contrast_db)
-        playing["predicted_level_db_sl"] = _finite(sensation.level_db_sl)
+        playing["promised_contrast_db"] = finite(sensation.promised_contrast_db)
+        playing["predicted_contrast_db"] = finite(sensation.contrast_db)
+        playing["predicted_level_db_sl"] = finite(sensation.level_db_sl)
     return playing
 
 
@@ -205,7 +205,7 @@ def _played_tones(drive: Drive) -> dict[str, PlayedTone]:
     return tones
 
 
-def _finite(value: float | None) -> float | None:
+def finite(value: float | None) -> float | None:
     """Return a finite value unchanged; None for infinity and NaN, which JSON lacks."""
     return value if value is not None and abs(value) < float("inf") else None
 

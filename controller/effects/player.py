@@ -31,7 +31,7 @@ NOTICED_ABOVE_DB = 3.0
 
 
 @dataclass
-class _Play:
+class Play:
     """A run of an effect at one finger."""
 
     name: str
@@ -42,6 +42,8 @@ class _Play:
     above_db: float | None  # see `Target`
     is_requested: bool = False  # whether a client requested it by name
     player: str | None = None  # client that requested it
+    targets: tuple[Target, ...] | None = None
+    """Its targets in the latest intent; None before the first one."""
 
     @property
     def priority(self) -> int:
@@ -54,6 +56,13 @@ class _Play:
     def is_elsewhere(self) -> bool:
         """Whether it is the layout's effect outside all regions."""
         return self.region is None and not self.is_requested
+
+    @property
+    def why_paused(self) -> str:
+        """Why it has no stimulus although it has not ended."""
+        if self.effect.is_for_motion:
+            return f"{self.name} is felt only {self.effect.motion_condition}"
+        return f"{self.name} pauses; it continues on its own"
 
     @property
     def outlasts_its_layout(self) -> bool:
@@ -69,7 +78,7 @@ class _Finger:
     since: float  # s; when it came down
     region: Region | None
     entered: tuple[float, float]  # m; point of entry into the region
-    plays: list[_Play] = field(default_factory=list)
+    plays: list[Play] = field(default_factory=list)
     ended: str = ""  # name of the effect that ended most recently
 
 
@@ -77,7 +86,7 @@ class _FeltPlay(NamedTuple):
     """A play with its current stimulus."""
 
     key: ContactKey
-    play: _Play
+    play: Play
     stimulus: EffectStimulus
 
 
@@ -114,6 +123,7 @@ class EffectPlayer:
         felt_plays = _with_newest_elsewhere(felt_plays)
         is_alone = len(contacts) == 1
         targets = [_target(felt, is_alone=is_alone) for felt in felt_plays]
+        self._note_targets(felt_plays, targets)
         self._targeted = {target.key for target in targets}
         self._clicks.keep({target.key for target in targets if target.is_short})
         playing = []
@@ -134,6 +144,19 @@ class EffectPlayer:
             protected=self._protected(),
             gains_db=self._gains_db(felt_plays, targets),
         )
+
+    def _note_targets(self, felt_plays: Sequence[_FeltPlay], targets: Sequence[Target]) -> None:
+        """Store the targets of all plays."""
+        for finger in self._fingers.values():
+            for play in finger.plays:
+                play.targets = ()
+        for felt, target in zip(felt_plays, targets, strict=True):
+            felt.play.targets = (*(felt.play.targets or ()), target)
+
+    def is_active(self, play: Play, key: ContactKey) -> bool:
+        """Whether a play at a finger has neither ended nor been replaced."""
+        finger = self._fingers.get(key)
+        return finger is not None and any(active is play for active in finger.plays)
 
     def has_effect_at(self, contact: Contact) -> bool:
         """Whether a contact that comes down here starts an effect."""
@@ -180,9 +203,7 @@ class EffectPlayer:
             return f"{name} came too soon after short effects of other fingers; touch there again"
         if key in self._stimulated:
             return f"{name} is felt only by the newest finger outside all regions; lift that finger"
-        if play.effect.is_for_motion:
-            return f"{name} is felt only {play.effect.motion_condition}"
-        return f"{name} pauses; it continues on its own"
+        return play.why_paused
 
     def replace(self, layout: SurfaceLayout) -> None:
         """Switch to another layout; fingers already on the plate feel none of its press effects.
@@ -210,7 +231,7 @@ class EffectPlayer:
         level_db_sl: float | None,
         player: str | None = None,
         effect: Effect | None = None,
-    ) -> None:
+    ) -> Play:
         """Start a named effect at a finger, in place of an earlier request of that name.
 
         level_db_sl: replaces the level of the effect unless None; player: client whose strength
@@ -228,7 +249,7 @@ class EffectPlayer:
             play for play in finger.plays if not (play.is_requested and play.name == name)
         ]
         run = _run_of(effect, finger.region, contact, now, level_db_sl=level_db_sl)
-        play = _Play(
+        play = Play(
             name,
             effect,
             run,
@@ -239,6 +260,7 @@ class EffectPlayer:
             player=player,
         )
         finger.plays.append(play)
+        return play
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""
@@ -305,7 +327,7 @@ class EffectPlayer:
         level_db_sl = self.layout.level_of(name, region)
         run = _run_of(effect, region, contact, now, level_db_sl=level_db_sl)
         above_db = None if effect.gives_level_in(region) else CLICK_ABOVE_DB
-        finger.plays.append(_Play(name, effect, run, self._next_number(), region, above_db))
+        finger.plays.append(Play(name, effect, run, self._next_number(), region, above_db))
 
     def _next_number(self) -> int:
         self._play_count += 1
@@ -355,7 +377,7 @@ def _felt_by(
     Calls all plays, because motion effects follow the finger, and removes plays that have ended.
     """
     felt: dict[bool, _FeltPlay] = {}  # by whether it is a short pulse
-    active: list[_Play] = []
+    active: list[Play] = []
     for play in finger.plays:
         stimulus = play.run.feel(contact, now)
         if stimulus is None:

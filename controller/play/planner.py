@@ -151,6 +151,11 @@ class Planner:
         return min(self._intent_due, self._retry_at, self._selector.due)
 
     @property
+    def selection(self) -> Selection | None:
+        """The contents of the last plan; None if it is unknown which contents play."""
+        return None if self._last_plan is None else self._last_plan.selection
+
+    @property
     def is_waiting(self) -> bool:
         """Whether a change of fingers is not planned yet, or contents are being chosen."""
         return bool(self._tracker.changed) or self._selector.pending is not None

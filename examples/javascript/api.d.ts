@@ -24,8 +24,8 @@ export interface Methods {
   reload: { params: Empty; result: ReloadResult };
   /** List the available effects. */
   effects: { params: Empty; result: EffectsResult };
-  /** Play an effect, or points and taps, at a finger; only while armed. */
-  play: { params: PlayParams; result: Empty };
+  /** Play an effect, or points and taps, at a finger; only while armed. Returns the outcome: when it starts and at which level, or why it is not played. */
+  play: { params: PlayParams; result: PlayResult };
   /** Set or show the strength of a source, client or region. The status shows all strengths. Active effects fade to the new strength within 100 ms. */
   strength: { params: StrengthParams; result: StrengthResult };
   /** Subscribe to notifications of topics. */
@@ -255,6 +255,28 @@ export interface PlayParams {
   taps?: Array<Array<number>>;
   /** whether points or a file repeat from the start */
   loop?: boolean;
+}
+
+/** Outcome of a request to play, once the amplifiers have confirmed it or it was given up. */
+export interface PlayResult {
+  /** played: confirmed by the amplifiers; late: it was over, or had lost its touch, before they could play it; held back: not played, for a reason; pending: not yet, because it begins with a pause, waits for a movement, or was not decided within 2 s */
+  outcome: "played" | "late" | "held back" | "pending";
+  /** why it is not played, or why the finger shares another vibration; null otherwise */
+  reason?: string | null;
+  /** when the amplifiers start it, on CLOCK_MONOTONIC; the following values are null if it is not played */
+  start_s?: number | null;
+  /** null if it has several frequencies */
+  frequency_hz?: number | null;
+  /** predicted level on the nominal plate, relative to the rig's threshold set; over the duration of a short vibration, onset included */
+  level_db_sl?: number | null;
+  /** level that 90 % of plates within the rig's tolerances reach */
+  promised_level_db_sl?: number | null;
+  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
+  promised_contrast_db?: number | null;
+  /** as in the status */
+  verdict?: "own" | "mixed" | "shared" | null;
+  /** all other fingers, in order of arrival */
+  other_fingers?: Array<OtherFinger>;
 }
 
 /** A touch source, client or region and its gain; without a gain, nothing changes. */
@@ -518,6 +540,18 @@ export interface EffectDescription {
   description: string;
   /** parameters by name in a layout file, in SI units */
   parameters: Record<string, unknown>;
+}
+
+/** Another finger on the plate, and the vibrations of others that reach it. */
+export interface OtherFinger {
+  source: string;
+  id: number;
+  x_m: number;
+  y_m: number;
+  /** as in the status: not exceeded on 90 % of plates, relative to the most sensitive published thresholds; null if unknown or without vibrations of others */
+  foreign_level_db_sl: number | null;
+  /** the same level relative to the rig's threshold set */
+  rig_foreign_level_db_sl: number | null;
 }
 
 /** Position of an ERA under the plate, from the south-west corner, and its wiring. */

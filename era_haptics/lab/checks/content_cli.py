@@ -73,7 +73,8 @@ def play(
 ) -> None:
     """Play content at a finger, or write it as sound.
 
-    Plays the content once at the finger within 20 mm of --at. With --simulate, writes the simulated
+    Plays the content once at the finger within 20 mm of --at; exits with 1 if it is late or held
+    back. With --simulate, writes the simulated
     acceleration at a single finger there to a WAV file (16 bits, 48 kHz) instead, for listening or
     plotting. The full scale is fixed, so the loudness of several files can be compared by ear.
     """
@@ -100,14 +101,21 @@ def play(
             from era_haptics.lab.checks.content_points import points_of
 
             points, taps = points_of(pattern_of(file, channel))
-            era.play(points, place, taps=taps, level_db_sl=level, loop=loop)
+            played = era.play(points, place, taps=taps, level_db_sl=level, loop=loop)
         else:
-            era.play(str(file), place, level_db_sl=level, loop=loop)
+            played = era.play(str(file), place, level_db_sl=level, loop=loop)
+    row = f"{file} plays at ({place[0]:g}, {place[1]:g}) m"
+    if played.level_db_sl is not None:
+        row += f" at {played.level_db_sl:.1f} dB SL"
+    if played.reason is not None:
+        row = f"{file}: {played.outcome}: {played.reason}"
     print_report(
-        [f"{file} plays at ({place[0]:g}, {place[1]:g}) m", "Next: era status"],
-        {"file": str(file), "at_m": [*place]},
+        [row, "Next: era status"],
+        {"file": str(file), "at_m": [*place], **played.model_dump(mode="json")},
         as_json=as_json,
     )
+    if played.outcome in ("late", "held back"):
+        raise typer.Exit(FAILED)
 
 
 def pattern_of(file: Path, channel: int | None = None) -> "Pattern":

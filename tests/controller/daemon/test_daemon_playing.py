@@ -385,6 +385,80 @@ async def test_daemon_plays_effects_by_region_and_by_name() -> None:
         assert status.silence_reason is None
 
 
+@in_virtual_time
+async def test_play_returns_start_and_levels_as_the_status_reports_them() -> None:
+    """Of a click over the continuous vibration that it interrupts, and of that vibration."""
+    async with served_daemon(has_seats=True, layouts={"quiet": "elsewhere: null"}) as daemon:
+        era = daemon.era
+        async with daemon.guest.resting([PLACES[seat] for seat in SEATS]), era.armed("me"):
+            hum = await era.play([(0, 1, 0.5), (5, 1, 0.5)], PLACES["left"], level_db_sl=18)
+            assert hum.outcome == "played"
+            assert hum.start_s == pytest.approx(threads.now(), abs=0.01)
+            left, right = (await hold_for(daemon, 0.1)).contacts
+            assert (hum.frequency_hz, hum.verdict) == (left.frequency_hz, left.verdict)
+            assert hum.level_db_sl == left.level_db_sl
+            assert hum.promised_contrast_db == left.promised_contrast_db
+            (other,) = hum.other_fingers
+            assert (other.source, other.id) == (right.source, right.id)
+            assert other.foreign_level_db_sl == right.foreign_level_db_sl
+            assert other.rig_foreign_level_db_sl == right.rig_foreign_level_db_sl
+
+            click = await era.play("click", PLACES["left"])
+            assert click.outcome == "played"
+            assert click.level_db_sl == pytest.approx(24, abs=0.01)  # 6 dB above
+            again = await era.play("click", PLACES["right"])
+            assert (again.start_s or 0) - (click.start_s or 0) >= 0.06  # it waits for its turn
+
+
+@in_virtual_time
+async def test_play_returns_why_an_effect_is_late_or_held_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Held back by a strength, after a choice of 0.5 s, by a stop, and before its first click."""
+    tap = [(0.5, 1.0, 0.5)]
+    short, steady = [(0, 1, 0.5), (0.2, 1, 0.5)], [(0, 1, 0.5), (5, 1, 0.5)]
+    async with served_daemon(has_seats=True, layouts={"quiet": "elsewhere: null"}) as daemon:
+        era = daemon.era
+        async with daemon.guest.resting([PLACES[seat] for seat in SEATS]):
+            await era.arm("me", lease_s=60)
+            waiting = await era.play([], PLACES["left"], taps=tap)
+            assert (waiting.outcome, waiting.start_s) == ("pending", None)
+            assert "pauses" in (waiting.reason or "")
+            await asyncio.sleep(1.0)
+
+            await era.strength("test", -40)
+            weak = await era.play(steady, PLACES["left"], level_db_sl=12)
+            assert (weak.outcome, weak.level_db_sl) == ("held back", None)
+            assert "strength" in (weak.reason or "")
+            await era.strength("test", 0)
+
+            answers_take(monkeypatch, 0.5)
+            late = await era.play(short, PLACES["right"])
+            assert (late.outcome, late.start_s) == ("late", None)
+
+            await asyncio.sleep(1.0)
+            stopped = asyncio.create_task(era.play(steady, PLACES["right"]))
+            await asyncio.sleep(0.1)
+            await daemon.guest.stop()
+            held_back = await stopped
+            assert held_back.outcome == "held back"
+            assert "stopped" in (held_back.reason or "")
+
+
+@in_virtual_time
+async def test_fingers_rest_until_the_end_of_the_block() -> None:
+    """Also after lost connections; then they are lifted immediately."""
+    async with served_daemon() as daemon:
+        async with daemon.guest.resting([PLACES["pad"]]):
+            landed = (await hold_for(daemon, 1.0)).contacts
+            assert len(landed) == 1
+            for connection in [*daemon.bench.daemon.server.clients]:
+                connection.abort()
+            landed = (await hold_for(daemon, 1.0)).contacts
+            assert len(landed) == 1
+        assert (await hold_for(daemon, 0.0)).contacts == []
+
+
 REFUSED_EFFECTS: Sequence[tuple[Any, dict[str, Any], str]] = (
     ("unknown", {}, "unknown"),
     ("alert", {"level_db_sl": 18.1}, "level"),

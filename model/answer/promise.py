@@ -342,30 +342,48 @@ def share_stroke(
 ) -> tuple[FloatArray, float]:
     """Lower gains (K,) to levels (K,) until they fit the stroke; also return the smallest factor.
 
-    Among contents of equal priority, the louder ones are lowered first to a common level (max-min
-    fairness), until all fit into what higher priorities leave.
+    Among contents of equal priority, the louder ones are lowered first (`_max_min_factors`), until
+    all fit into what higher priorities leave.
     """
     amplitudes = gains[:, None] * np.abs(weights)
     factors = np.zeros(len(gains))
     free_stroke = np.ones(amplitudes.shape[1])
     for priority in sorted({*priorities}, reverse=True):
         has_priority = np.array(priorities) == priority
-        is_lowered = has_priority
-        level = 0.0
-        while is_lowered.any():
-            unlowered = amplitudes[has_priority & ~is_lowered].sum(axis=0)
-            per_level = (amplitudes[is_lowered] / levels[is_lowered, None]).sum(axis=0)
-            remaining = np.maximum(free_stroke - unlowered, 0)
-            level = float((remaining / np.maximum(per_level, 1e-30)).min())
-            if (levels[is_lowered] > level).all():
-                break
-            is_lowered = is_lowered & (levels > level)
-        lowering = np.where(is_lowered[has_priority], level / levels[has_priority], 1.0)
+        strokes = amplitudes[has_priority]
+        lowering = _max_min_factors(strokes, levels[has_priority], free_stroke)
         factors[has_priority] = lowering
-        used = lowering @ amplitudes[has_priority]
+        used = lowering @ strokes
         is_full = used >= free_stroke * (1 - NEARLY)  # rounding leaves no stroke
         free_stroke = np.where(is_full, 0.0, free_stroke - used)
     return gains * factors, float(factors.min())
+
+
+def _max_min_factors(
+    strokes: FloatArray, levels: FloatArray, free_stroke: FloatArray
+) -> FloatArray:
+    """Return factors (K,) on strokes (K, eras) of contents, by max-min fairness.
+
+    The level of all rises until it is a content's own, or until an ERA is full, which ends the rise
+    of every content that uses it; the others go on (progressive filling: Bertsekas and Gallager,
+    Data Networks, 2nd ed., section 6.5.2).
+    """
+    factors = np.ones(len(levels))
+    is_rising = np.ones(len(levels), dtype=bool)
+    for _ in levels:  # at least one content ends in each round
+        settled = (factors[:, None] * strokes)[~is_rising].sum(axis=0)
+        per_level = (strokes[is_rising] / levels[is_rising, None]).sum(axis=0)
+        remaining = np.maximum(free_stroke - settled, 0)
+        level_by_era = np.full(len(free_stroke), np.inf)  # where nothing rises
+        np.divide(remaining, per_level, out=level_by_era, where=per_level > _TINY_AMPLITUDE)
+        level = level_by_era.min()
+        has_ended = is_rising & (levels <= level)
+        if not has_ended.any():
+            is_full = level_by_era <= level * (1 + NEARLY)
+            has_ended = is_rising & (strokes[:, is_full] > 0).any(axis=1)
+            factors[has_ended] = level / levels[has_ended]
+        is_rising &= ~has_ended
+    return factors
 
 
 def felt_amplitudes(

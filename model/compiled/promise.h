@@ -80,47 +80,69 @@ INLINE void keep(float *values, lanes found, const draws *by, size_t group) {
     memcpy(values + first, &found, count * sizeof(float));
 }
 
+/* Lower the gains of some contents until they fit into the free stroke, by max-min fairness: the level of all rises until
+ * it is a content's own, or until an ERA is full, which ends the rise of every content that uses it. strokes (contents,
+ * n): of each content at its full level; return the smallest factor. */
+SHARED float lower_to_stroke(float *gains, const float *strokes, const float *levels, const int *is_sharing,
+                             const float *free_stroke, size_t contents, size_t n, arena *memory) {
+    const arena mark = *memory;
+    float *factors = floats(memory, contents), *level_by_era = floats(memory, n), least = 1;
+    int *is_rising = integers(memory, contents);
+    for (size_t j = 0; j < contents; j++) factors[j] = 1, is_rising[j] = is_sharing[j];
+    for (size_t round = 0; round < contents; round++) { /* at least one content ends in each */
+        float level = INFINITY;
+        for (size_t e = 0; e < n; e++) {
+            float settled = 0, per_level = 0;
+            for (size_t j = 0; j < contents; j++) {
+                if (is_rising[j]) per_level += strokes[j * n + e] / levels[j];
+                else if (is_sharing[j]) settled += factors[j] * strokes[j * n + e];
+            }
+            level_by_era[e] = per_level > LEAST ? fmaxf(free_stroke[e] - settled, 0) / per_level : INFINITY;
+            level = fminf(level, level_by_era[e]);
+        }
+        int any_reached = 0;
+        for (size_t j = 0; j < contents; j++)
+            if (is_rising[j] && levels[j] <= level) is_rising[j] = 0, any_reached = 1;
+        for (size_t j = 0; j < contents && !any_reached; j++) {
+            int is_limited = 0;
+            for (size_t e = 0; e < n; e++)
+                if (level_by_era[e] <= level * (1 + NEARLY) && strokes[j * n + e] > 0) is_limited = is_rising[j];
+            if (is_limited) factors[j] = level / levels[j], is_rising[j] = 0;
+        }
+    }
+    for (size_t j = 0; j < contents; j++)
+        if (is_sharing[j]) gains[j] *= factors[j], least = fminf(least, factors[j]);
+    release(memory, mark);
+    return least;
+}
+
 /* Lower the gains until all contents fit into the stroke; return the smallest factor. Higher priorities get the stroke
- * first. Within a priority, the loudest contents are lowered to a common level (max-min fairness). */
+ * first; contents of one priority share what remains (`lower_to_stroke`). */
 SHARED float share_stroke(float *gains, const question *of, const float *weights, size_t n, arena *memory) {
     const size_t contents = of->contents;
     const arena mark = *memory;
-    float *left = floats(memory, n), *full = floats(memory, n), least = 1;
-    int *done = integers(memory, contents), *is_lowered = integers(memory, contents);
-    for (size_t e = 0; e < n; e++) left[e] = 1;
-    memset(done, 0, contents * sizeof(int));
+    float *strokes = floats(memory, contents * n), *free_stroke = floats(memory, n), least = 1;
+    int *is_done = integers(memory, contents), *is_sharing = integers(memory, contents);
+    for (size_t i = 0; i < contents * n; i++) strokes[i] = gains[i / n] * hypotf(weights[2 * i], weights[2 * i + 1]);
+    for (size_t e = 0; e < n; e++) free_stroke[e] = 1;
+    memset(is_done, 0, contents * sizeof(int));
     for (;;) {
         int highest = 0, any = 0;
         for (size_t j = 0; j < contents; j++)
-            if (!done[j] && (!any || of->priority[j] > highest)) highest = of->priority[j], any = 1;
+            if (!is_done[j] && (!any || of->priority[j] > highest)) highest = of->priority[j], any = 1;
         if (!any) break;
-        float level = INFINITY;
-        for (size_t j = 0; j < contents; j++) is_lowered[j] = !done[j] && of->priority[j] == highest;
-        for (int raised = 1; raised;) {
-            level = INFINITY, raised = 0;
-            for (size_t e = 0; e < n; e++) {
-                float kept = 0, per_level = 0;
-                for (size_t j = 0; j < contents; j++)
-                    if (!done[j] && of->priority[j] == highest) {
-                        const float full = gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
-                        if (is_lowered[j]) per_level += full / of->level[j];
-                        else kept += full;
-                    }
-                level = fminf(level, fmaxf(left[e] - kept, 0) / fmaxf(per_level, LEAST));
-            }
+        for (size_t j = 0; j < contents; j++) is_sharing[j] = !is_done[j] && of->priority[j] == highest;
+        const float factor =
+            lower_to_stroke(gains, strokes, of->level, is_sharing, free_stroke, contents, n, memory);
+        least = fminf(least, factor);
+        for (size_t e = 0; e < n; e++) {
+            float used = 0;
             for (size_t j = 0; j < contents; j++)
-                if (is_lowered[j] && of->level[j] <= level) is_lowered[j] = 0, raised = 1;
+                if (is_sharing[j]) used += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
+            /* rounding must not leave a rest of the stroke */
+            free_stroke[e] = used >= free_stroke[e] * (1 - NEARLY) ? 0 : free_stroke[e] - used;
         }
-        memset(full, 0, n * sizeof(float));
-        for (size_t j = 0; j < contents; j++)
-            if (!done[j] && of->priority[j] == highest) {
-                const float factor = is_lowered[j] ? level / of->level[j] : 1;
-                gains[j] *= factor, done[j] = 1, least = fminf(least, factor);
-                for (size_t e = 0; e < n; e++)
-                    full[e] += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
-            }
-        for (size_t e = 0; e < n; e++) /* rounding must not leave a rest of the stroke */
-            left[e] = full[e] >= left[e] * (1 - NEARLY) ? 0 : left[e] - full[e];
+        for (size_t j = 0; j < contents; j++) is_done[j] |= is_sharing[j];
     }
     release(memory, mark);
     return least;

@@ -207,6 +207,43 @@ def test_higher_priority_has_its_stroke_first() -> None:
     assert factor == pytest.approx(0.45)
 
 
+@pytest.mark.parametrize(
+    ("needs", "expected"),
+    [((0.8, 0.4, 0.3), (0.375, 1, 1)), ((0.8, 0.8, 0.3), (0.175, 0.7, 1))],
+    ids=["one", "two"],
+)
+def test_loudest_contents_are_lowered_first(needs: list[float], expected: list[float]) -> None:
+    """By hand: levels of 8, 2 and 1, which need these shares of an ERA.
+
+    The first is lowered, or the first two end at the level 1.4: 0.14 + 0.56 + 0.3.
+    """
+    weights = np.array(needs, dtype=np.complex64)[:, None]
+
+    gains, factor = share_stroke(np.ones(3), weights, np.array([8.0, 2.0, 1.0]), [0, 0, 0])
+
+    assert gains == pytest.approx(expected)
+    assert factor == pytest.approx(min(expected))
+
+
+def test_full_era_lowers_only_contents_that_use_it() -> None:
+    """By hand: two contents share one ERA; the third has another one and plays in full."""
+    weights = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.5]], dtype=np.complex64)
+
+    gains, factor = share_stroke(np.ones(3), weights, np.ones(3), [0, 0, 0])
+
+    assert gains == pytest.approx([0.5, 0.5, 1.0])
+    assert factor == pytest.approx(0.5)
+
+
+def test_content_ignores_a_full_era_that_it_does_not_use() -> None:
+    """By hand: a content of high priority fills the first ERA, the other plays on the second."""
+    weights = np.array([[2.0, 0.0], [0.0, 0.5]], dtype=np.complex64)
+
+    gains, _ = share_stroke(np.ones(2), weights, np.ones(2), [1, 0])
+
+    assert gains == pytest.approx([0.5, 1.0])
+
+
 # Rejected questions
 
 REJECTED = read_yaml(FOLDER / "rejected.yaml")

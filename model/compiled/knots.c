@@ -51,10 +51,9 @@ static matrix hats_of(const shaped_tone *of, const shaping *by, size_t first, si
     return found;
 }
 
-/* Return the form (count span) squared of hats, summed over all steps, with gain errors. Only the upper blocks of
- * pairs of combinations are computed. */
-static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots, size_t span, float gain_variance,
-                     arena *memory) {
+/* Return the form (count span) squared of hats, summed over all steps. Only the upper blocks of pairs of combinations
+ * are computed. */
+static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots, size_t span, arena *memory) {
     const size_t width = count * span;
     const matrix form = zeros(width, apart(width), memory);
     for (size_t i = 0; i < width; i += 4)
@@ -69,12 +68,41 @@ static matrix summed(const matrix *hats, size_t rows, size_t count, size_t knots
                 }
                 for (size_t l = knots; l < span; l++) form.re[to + l] = form.im[to + l] = 0;
             }
-    for (size_t row = 0; row < width; row++)
-        for (size_t l = 0; l < span; l += LANES) {
-            const size_t own = row * form.width + row / span * span + l;
-            put(&form, own, scaled(at(&form, own), filled(1 + gain_variance)));
-        }
     return form;
+}
+
+/* Add the effect of errors of the gains to a form over ERAs: more of the parts of a single ERA. */
+static void add_errors(const matrix *form, size_t count, size_t span, float gain_variance) {
+    for (size_t row = 0; row < count * span; row++)
+        for (size_t l = 0; l < span; l += LANES) {
+            const size_t own = row * form->width + row / span * span + l;
+            put(form, own, scaled(at(form, own), filled(1 + gain_variance)));
+        }
+}
+
+/* The same for a form over combinations (count, width) of n ERAs: in a combination the parts of all ERAs may cancel,
+ * their errors do not. hats (rows, n span): of the ERAs. */
+static void add_combined_errors(const matrix *form, const matrix *hats, size_t rows, const matrix *combinations, size_t n,
+                                size_t count, size_t knots, size_t span, float gain_variance, arena *memory) {
+    const size_t width = combinations->width;
+    for (size_t e = 0; e < n; e++) {
+        const arena mark = *memory;
+        const matrix own_hats = {.re = hats->re + e * span, .im = hats->im + e * span, .width = hats->width};
+        const matrix own = summed(&own_hats, rows, 1, knots, span, memory);
+        for (size_t a = 0; a < count; a++)
+            for (size_t b = a; b < count; b++) {
+                const float re_a = combinations->re[a * width + e], im_a = -combinations->im[a * width + e];
+                const float re_b = combinations->re[b * width + e], im_b = combinations->im[b * width + e];
+                const value factor = {.re = filled(gain_variance * (re_a * re_b - im_a * im_b)),
+                                      .im = filled(gain_variance * (re_a * im_b + im_a * re_b))};
+                for (size_t k = 0; k < knots; k++)
+                    for (size_t l = 0; l < span; l += LANES) {
+                        const size_t to = (a * span + k) * form->width + b * span + l;
+                        put(form, to, add_product(at(form, to), at(&own, k * own.width + l), factor));
+                    }
+            }
+        release(memory, mark);
+    }
 }
 
 /* Add sign times the form, in rows of the first knots, times a constant (count) at knots `first` to `end`. */
@@ -179,8 +207,8 @@ static void shape_onset(double *found, const shaped_tone *of, const shaping *by,
     for (size_t row = 0; row < by->samples * rows; row++)
         for (size_t j = 0; j < n * span && row % rows < t; j += LANES)
             put(&hats, row * hats.width + j, scaled(at(&hats, row * hats.width + j), filled(weight)));
+    const matrix all = hats;
     if (count < n) {
-        const matrix all = hats;
         combinations = strongest(of->amplitudes, n, count, &all, by->samples * rows, span, memory);
         hats = zeros(by->samples * rows, apart(count * span), memory);
         for (size_t row = 0; row < by->samples * rows; row++) {
@@ -190,7 +218,11 @@ static void shape_onset(double *found, const shaped_tone *of, const shaping *by,
         }
     } else
         for (size_t e = 0; e < n; e++) combinations.re[e * width + e] = 1;
-    const matrix form = summed(&hats, by->samples * rows, count, steps, span, of->gain_variance, memory);
+    const matrix form = summed(&hats, by->samples * rows, count, steps, span, memory);
+    if (count < n)
+        add_combined_errors(&form, &all, by->samples * rows, &combinations, n, count, steps, span, of->gain_variance, memory);
+    else
+        add_errors(&form, n, span, of->gain_variance);
     const matrix right = zeros(count, span, memory), settled = zeros(1, count, memory), line = zeros(1, 3 * span, memory);
     for (size_t sample = 0; sample < (size_t)by->samples; sample++)
         for (size_t a = 0; a < count; a++) {
@@ -236,7 +268,8 @@ static void shape_ending(double *found, const shaped_tone *of, const shaping *by
     }
     if (rows) {
         const matrix hats = hats_of(of, by, first, knots, span, memory);
-        form = summed(&hats, by->samples * rows, n, knots, span, of->gain_variance, memory);
+        form = summed(&hats, by->samples * rows, n, knots, span, memory);
+        add_errors(&form, n, span, of->gain_variance);
         add_held(&right, &form, &start, 1, n, span, free, 0, knots);
         for (size_t row = 0; row < rows; row++) {
             const double *steady = of->steady + 2 * n * (first + row);

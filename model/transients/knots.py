@@ -3,7 +3,8 @@
 Forms are over knots and ERAs, knots * eras rows, ERAs running fastest; amplitudes are in strokes.
 Gains and phases of the ERAs are known to a few percent and degrees only (the rig's `uncertainty`):
 with a complex factor 1 + d_e for ERA e the expected form grows by var(d) times each ERA's own part.
-Every form includes that, so that the minimum does not rely on exact cancellation.
+Every form includes that, so that the minimum does not rely on exact cancellation, neither of ERAs
+nor within a combination of ERAs.
 
 The basis of piecewise linear envelopes is hat functions, with responses in closed form. A hat is a
 drive at a carrier exp(s t) that rises from zero to an ERA's full stroke in one step and falls to
@@ -58,6 +59,17 @@ STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
 # Relative to the mean of a form's diagonal: keeps it definite, costs no contrast.
 _RIDGE = 1e-6
 
+# Weight of a quiet finger's motion during an ending, relative to the target, against the plate's
+# residual vibration, relative to the steady one. Three times as much changes both by about 1 dB;
+# zero makes the ending as loud for the quiet finger as a plain ramp.
+_QUIET_WEIGHT = 0.03
+
+# With this penalty (relative to the mean of the diagonal) and over-relaxation the forms that
+# shaping makes are within 0.1 dB of their minimum after 30 steps; found by trying 1e-4 to 0.3.
+PENALTY = 0.03
+RELAXATION = 1.6
+ITERATIONS = 30
+
 
 @dataclass(frozen=True, eq=False)
 class Carrier:
@@ -103,8 +115,8 @@ def solve_carrier(
     hats = hats.reshape(STEPS, SAMPLES, *hats.shape[1:])[::-1].transpose(1, 3, 0, 2)
     states = ending_states(plate, omega, step=KNOT_STEP, steps=ENDING_KNOTS)
     flat = states.reshape(len(states), -1)
-    form = flat.conj().T @ residual_form @ flat
-    _add_errors(form, len(plate.eras), gain_variance)
+    certain_form = flat.conj().T @ residual_form @ flat
+    form = _with_errors(certain_form, len(plate.eras), gain_variance)
     return Carrier(
         np.ascontiguousarray(hats, dtype=np.complex64),
         steady,
@@ -131,7 +143,7 @@ def onset_by_numpy(
     combinations = _combinations(hats, amplitudes, responses.combinations)
     combined: _ComplexArray = hats @ combinations
     count = combinations.shape[1]
-    form = _summed(combined, gain_variance)
+    form = _expected_form(hats, combined, combinations, gain_variance)
     wanted = (weights[:t, 0, 0] * steady[:t].sum(axis=1)).astype(np.complex64)
     along = np.tensordot(wanted, combined[:, :t].conj(), axes=(0, 1)).reshape(-1, count)
     settled = np.tile((amplitudes @ combinations.conj()).astype(np.complex64), STEPS - free)
@@ -207,7 +219,8 @@ def while_ending(
     """
     count = ENDING_KNOTS * SAMPLES
     hats = responses.hats[:, responses.targets :, -ENDING_KNOTS:]
-    form = _summed(hats / np.float32(math.sqrt(count)), gain_variance)
+    certain_form = _summed(hats / np.float32(math.sqrt(count)))
+    form = _with_errors(certain_form, len(start), gain_variance)
     tones = start * responses.steady[responses.targets :]
     tones = tones.sum(axis=1, keepdims=True) + gain_variance * tones  # with errors, as the form
     by_knot = (hats.sum(axis=0).conj() * tones[:, None]).sum(axis=0)
@@ -223,8 +236,28 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
     return float(together + gain_variance * np.linalg.norm(responses) ** 2)
 
 
-def _summed(responses: _ComplexArray, gain_variance: float) -> _ComplexArray:
-    """Return the expected form over knots and ERAs of squares, summed over samples, rows and steps.
+def _expected_form(
+    hats: Complex64Array,
+    combined: _ComplexArray,
+    combinations: Complex64Array,
+    gain_variance: float,
+) -> _ComplexArray:
+    """Return the expected form over knots and combinations (eras, c) of ERAs, as `_summed`.
+
+    hats (samples, d, knots, eras): responses to the ERAs; combined: to the combinations. Errors are
+    those of each ERA: in a combination the parts of all ERAs may cancel, their errors do not.
+    """
+    eras, count = combinations.shape
+    certain_form = _summed(combined)
+    if count == eras:  # every combination is an ERA
+        return _with_errors(certain_form, eras, gain_variance)
+    form_by_era = np.stack([_summed(hats[..., era, None]) for era in range(eras)])
+    errors = np.einsum("ea,ekl,eb->kalb", combinations.conj(), form_by_era, combinations)
+    return certain_form + np.float32(gain_variance) * errors.reshape(certain_form.shape)
+
+
+def _summed(responses: _ComplexArray) -> _ComplexArray:
+    """Return the form over knots and ERAs of squares, summed over samples, rows and steps.
 
     responses (samples, d, knots, eras): see `FingerResponses.hats`. In the step before the last,
     each hat responds like the next knot's hat in the last step, and so on.
@@ -236,15 +269,15 @@ def _summed(responses: _ComplexArray, gain_variance: float) -> _ComplexArray:
     while shift < len(form):  # sums of 2, 4, 8 ... steps
         form[:-shift, :-shift] += form[shift:, shift:]
         shift *= 2
-    _add_errors(form, eras, gain_variance)
     return form
 
 
-def _add_errors(form: _ComplexArray, eras: int, gain_variance: float) -> None:
-    """Add the effect of the ERAs' errors to a form: more of the parts of a single ERA."""
-    knots = len(form) // eras
-    own = np.einsum("kele->kle", form.reshape(knots, eras, knots, eras))
-    own *= np.float32(1 + gain_variance)
+def _with_errors(form: _ComplexArray, eras: int, gain_variance: float) -> _ComplexArray:
+    """Return the expected form with the ERAs' errors: more of the parts of a single ERA."""
+    era = np.arange(len(form)) % eras
+    is_single = era[:, None] == era
+    factor = np.where(is_single, np.float32(1 + gain_variance), np.float32(1))
+    return np.asarray(form * factor)
 
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
@@ -313,13 +346,6 @@ def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
     return shapes * np.expm1(rates * duration) / (rates * duration)
 
 
-# With this penalty (relative to the mean of the diagonal) and over-relaxation the forms that
-# shaping makes are within 0.1 dB of their minimum after 30 steps; found by trying 1e-4 to 0.3.
-PENALTY = 0.03
-RELAXATION = 1.6
-ITERATIONS = 30
-
-
 def bounded_minimum(
     form: _ComplexArray, right: _ComplexArray, combinations: Complex64Array
 ) -> ComplexArray:
@@ -338,7 +364,8 @@ def bounded_minimum(
 
     unbounded = knots_by(np.linalg.inv(form + _RIDGE * size * unit), right)
     feasible = _within(unbounded)
-    if feasible is not unbounded:
+    exceeds_stroke = np.abs(unbounded).max() > 1
+    if exceeds_stroke:
         penalty = PENALTY * size
         inverse = np.linalg.inv(form + (_RIDGE * size + penalty) * unit)
         offset = knots_by(inverse, right)
@@ -352,15 +379,8 @@ def bounded_minimum(
 
 
 def _within(knots: _ComplexArray) -> _ComplexArray:
-    """Limit magnitudes to 1; returns the same array if none is larger."""
-    sizes = np.abs(knots)
-    return np.asarray(knots / np.maximum(sizes, 1)) if sizes.max() > 1 else knots
-
-
-# Weight of a quiet finger's motion during an ending, relative to the target, against the plate's
-# residual vibration, relative to the steady one. Three times as much changes both by about 1 dB;
-# zero makes the ending as loud for the quiet finger as a plain ramp.
-_QUIET_WEIGHT = 0.03
+    """Limit magnitudes to 1."""
+    return np.asarray(knots / np.maximum(np.abs(knots), 1))
 
 
 def onset_knots(

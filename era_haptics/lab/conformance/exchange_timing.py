@@ -71,4 +71,4 @@ class ExchangeTiming:
         lateness = client.lateness
         reactions = lateness.reactions["refusals" if reply.code else name]
         reactions.append(beyond / count)
-        lateness.largest = max(lateness.largest, beyond - count * min(reactions))
+        lateness.note_delay(beyond - count * min(reactions))

@@ -256,7 +256,7 @@ class JudgeClient(ABC):
     async def replied(self, is_meant: Callable[[HeardMessage], bool], request: str) -> HeardMessage:
         """Return the reply to the last request.
 
-        Raises ContractViolation without a reply; a late reply counts as lateness of this machine.
+        Raises ContractViolation without a reply; a late reply counts as a delay.
         """
         started_at = threads.now()
         message = await self.next_message(is_meant, self.timeout)
@@ -268,7 +268,7 @@ class JudgeClient(ABC):
         has_new_message = any(message.at > started_at for message in self.history[-1:])
         is_sound = not remark or has_new_message
         if is_sound and await self.next_message(is_meant, _DELIVERY_TIMEOUT):
-            self.lateness.lag = max(self.lateness.lag, self.timeout)
+            self.lateness.note_delay(self.timeout)
             remark = ", but later"
         raise NoReply(request, f"no reply within {self.timeout:g} s{remark}")
 

@@ -57,10 +57,13 @@ class ModbusClient(JudgeClient):
         self.kind = "rtu" if is_rtu else "tcp"  # type: ignore[misc]
         self.has_broadcasts = is_rtu  # type: ignore[misc]
         self.is_rtu = is_rtu
-        self._reader = AduReader(is_rtu=is_rtu, of_requests=False)
+        self._reader = AduReader(is_rtu=is_rtu, of_requests=False, is_host=True)
 
     def hear(self, data: bytes) -> bytes:
-        """Extract responses and other bytes; skip the responses of a gateway."""
+        """Extract responses and other bytes; skip the responses of a gateway.
+
+        A response can arrive in pieces, which can contain a frame with a valid checksum.
+        """
         for adu in self._reader.feed(data):
             is_own = adu.unit == self.address or not adu.pdu
             if not is_own and adu.pdu[0] & EXCEPTION and adu.pdu[1:] in _GATEWAY_EXCEPTIONS:

@@ -11,7 +11,7 @@ from era_haptics.lab.conformance.capabilities import STATED, Capabilities
 from era_haptics.lab.conformance.check import ConformanceCheck
 from era_haptics.lab.conformance.conformance_report import CheckResult, Result
 from era_haptics.lab.conformance.judge_client import JudgeClient
-from era_haptics.lab.conformance.lateness import BUSY, FEW
+from era_haptics.lab.conformance.lateness import FEW
 from era_haptics.lab.conformance.outcomes import (
     AlreadyArmed,
     CheckOutcome,
@@ -49,6 +49,11 @@ class CheckAttempt(NamedTuple):
 
     outcome: CheckOutcome
     obstacle: str
+
+
+def _without_verdict(attempt: CheckAttempt) -> CheckAttempt:
+    """Return an attempt whose violation was seen too seldom to count."""
+    return attempt._replace(outcome=TooLate(f"unconfirmed violation: {attempt.outcome}"))
 
 
 async def greeted(client: JudgeClient) -> Values:
@@ -126,8 +131,7 @@ class ConformanceRun:
             tries = f"in {lateness.attempts or 1} attempts"
             if lateness.is_used_up:
                 tries = "because the time for repetitions is used up"
-            cause = lateness.slow_reply or f"this machine was late by {1e3 * lateness.lag:.0f} ms"
-            reason = f"no verdict {tries}: {reason}; {cause}"
+            reason = f"no verdict {tries}: {reason}; {lateness.cause}"
         if attempt.obstacle and attempt.obstacle != reason:
             reason = f"{reason}; then {attempt.obstacle}"
         return reason
@@ -140,16 +144,18 @@ class ConformanceRun:
         doubtful_violations = 0
         while True:
             started_at = threads.now()
-            lateness.lag = 0.0
+            lateness.begin_attempt()
             attempt = await self._attempt(check)
             is_late = isinstance(attempt.outcome, TooLate)
-            # A violation seen while this machine is late counts only if it is seen repeatedly.
+            # A violation seen while something is late counts only if it is seen repeatedly.
             is_violation = isinstance(attempt.outcome, ContractViolation)
-            is_doubtful = is_violation and lateness.lag > BUSY
+            is_doubtful = is_violation and lateness.is_disturbing
             doubtful_violations += is_doubtful
-            is_undecided = is_late or (is_doubtful and doubtful_violations < FEW)
-            if not is_undecided or attempt.obstacle or not lateness.repeats(started_at):
+            is_unconfirmed = is_doubtful and doubtful_violations < FEW
+            if attempt.obstacle or not (is_late or is_unconfirmed):
                 return attempt
+            if not lateness.repeats(started_at):
+                return _without_verdict(attempt) if is_unconfirmed else attempt
 
     async def _attempt(self, check: ConformanceCheck) -> CheckAttempt:
         """Run the steps of a check once, then bring the amplifier to rest."""

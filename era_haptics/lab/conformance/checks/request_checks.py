@@ -47,6 +47,7 @@ async def replies_in_time(subject: Subject) -> None:
     """GetStatus, GetCaps and GetFaults: each reply begins within 10 ms.
 
     Reply from memory, without waiting for a converter, for flash or for the next block of samples.
+    A delay of an emulator, serial server or adapter on the way counts too.
     """
     for name in ("GetStatus", "GetCaps", "GetFaults"):
         await _expect_prompt(subject, name, partial(subject.request, name))

@@ -26,7 +26,8 @@ from drivers.wires.serial_frames import FrameReader
 from era_haptics.lab.conformance.check import ConformanceCheck
 from era_haptics.lab.conformance.conformance_report import CheckResult, ConformanceReport
 from era_haptics.lab.conformance.contract import of_kind
-from era_haptics.lab.conformance.outcomes import ContractViolation
+from era_haptics.lab.conformance.lateness import ON_THE_WAY
+from era_haptics.lab.conformance.outcomes import ContractViolation, TooLate
 from era_haptics.lab.conformance.request_rows import layer
 from era_haptics.lab.conformance.run import ConformanceRun
 from era_haptics.lab.conformance.session import judge
@@ -535,6 +536,55 @@ def test_late_message_is_no_violation(
         (result,) = judged("serial", [name])
 
         assert result.result == "passed", (position, result.reason)
+
+
+@in_virtual_time
+async def test_reply_delayed_on_the_way_is_no_violation() -> None:
+    """A Status 600 ms late, seen once without time to repeat the check: no verdict, and why."""
+    with closing(JudgedLine("serial", varied())) as line:
+
+        async def read_late(subject: Subject) -> None:
+            await subject.request("GetStatus")
+            line.due = asyncio.get_running_loop().time() + 0.6
+            await subject.request("GetStatus")
+
+        check = ConformanceCheck("late", "passes", "", drives=False, kinds=(), steps=read_late)
+        line.client.lateness.wasted = 20.0
+        result = await ConformanceRun(line.client, 0.2).check(1, check)
+
+    assert isinstance(result.outcome, TooLate), result
+    assert ON_THE_WAY in result.reason
+
+
+@pytest.mark.parametrize("size", shortly([1, 3, 8, 64], [1, 8]))
+def test_rtu_response_can_arrive_in_pieces(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tag 65535 and zeros behind it are a valid frame of unit 255 inside a response."""
+    send = JudgedLine.send
+
+    def send_pieces(line: JudgedLine, data: bytes) -> None:
+        for start in range(0, len(data), size):
+            send(line, data[start : start + size])
+
+    monkeypatch.setattr(JudgedLine, "send", send_pieces)
+
+    results = judged("rtu", ["areas", "replies_in_time"])
+
+    expect_passed(results, set())
+
+
+@pytest.mark.parametrize("kind", shortly(["rtu", "tcp"], ["rtu"]))
+def test_ages_of_faults_can_change_between_two_reads(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A list with two faults, read by both functions 8 ms after each other."""
+    monkeypatch.setattr("kit.judged_lines.DELAY", 0.004)
+    far = plain()
+    for fault in ("WATCHDOG", "ARC"):
+        far.trip(fault, 0.0)
+
+    results = judged(kind, ["areas"], far=far)
+
+    expect_passed(results, set())
 
 
 # A real port

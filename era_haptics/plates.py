@@ -293,12 +293,7 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     expect_instance(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one with quiet fingers only")
-    promised = []
-    for finger in answer.fingers:
-        level = finger.promised_level_db_sl
-        contrast = finger.promised_contrast_db
-        promised.append(replace(finger, level_db_sl=level, contrast_db=contrast))
-    return contents_figure(table, answer.layers, promised)
+    return contents_figure(table, answer.layers, answer.promised_fingers)
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":

@@ -30,7 +30,7 @@ from model.quantities import counted
 from model.reduction.element_modes import FiniteElementModes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
-from model.reduction.supported_plate import on_springs
+from model.reduction.supported_plate import SupportedModes, on_springs, supported_modes
 from model.rig.rig import Rig
 from model.rig.rig_mesh import mesh_of
 from model.spectral.plate_mesh import PlateMesh, SpectralMesh
@@ -194,6 +194,18 @@ def plate_map(
     peak = peak_acceleration(np.abs(field)).reshape(rows, columns)
     nulls = find_nulls(x, y, peak)
     return PlateMap(x, y, peak, nulls, frequencies, field.reshape(-1, rows, columns))
+
+
+def damped_modes(rig: Rig) -> SupportedModes:
+    """Solve for all modes of a rig's plate on its ERAs, with damping ratios.
+
+    The modes extend to the highest frequency of the rig's limits. Raises InputError for a plate
+    without supports.
+    """
+    highest = rig.limits.frequency_max
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=highest)
+    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
+    return supported_modes(reduced, rig.eras, loads=rig.masses, frequency_max=highest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -247,6 +247,16 @@ class Answer:
         """Show the sensations without internal numbers."""
         return f"Answer(fingers={self.fingers}, applied={self.applied})"
 
+    @property
+    def promised_fingers(self) -> tuple[Sensation, ...]:
+        """The same sensations, with promised values as level and contrast: for pictures."""
+        promised = []
+        for finger in self.fingers:
+            level = finger.promised_level_db_sl
+            contrast = finger.promised_contrast_db
+            promised.append(replace(finger, level_db_sl=level, contrast_db=contrast))
+        return tuple(promised)
+
     @cached_property
     def fingers(self) -> tuple[Sensation, ...]:
         """Sensation of each finger, in the order of `asked`."""

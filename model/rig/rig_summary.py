@@ -58,7 +58,7 @@ def attachment_keys(rig: Rig, kind: str) -> dict[str, Any]:
 def summary_line(rig: Rig, *, verdict: str = "good") -> str:
     """Return one line about the plate and its ERAs; verdict: its first words."""
     plate = rig.plate
-    parts = [_plate_in_words(rig)]
+    parts = [plate_in_words(rig)]
     gap = plate.air_gap
     if gap is not None:
         edges = "sealed" if gap.closed else "open"
@@ -77,7 +77,7 @@ def summary_line(rig: Rig, *, verdict: str = "good") -> str:
     return f"{verdict}: {', '.join(parts)}"
 
 
-def _plate_in_words(rig: Rig) -> str:
+def plate_in_words(rig: Rig) -> str:
     """Return the size and the material of a plate, or the size of a surface."""
     plate, laminate = rig.plate, rig.laminate
     area = f"{1e3 * plate.length:g} x {1e3 * plate.width:g}"

@@ -122,7 +122,7 @@ def save_fitted(
     reads back with other values.
     """
     keys = fitted_keys(before, after)
-    document = _document_of(before)
+    document = document_of(before)
     save_beside(output, document, keys, comment=comment, errors=errors, expected=after)
 
 
@@ -131,7 +131,7 @@ def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
 
     None removes a key.
     """
-    document = _document_of(before)
+    document = document_of(before)
     section = Validation(document, RigSection).finish()
     data = cast("dict[str, Any]", document.data)
     changes = _changed_values(before, after, section)
@@ -178,14 +178,14 @@ def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
 
     Numbers in SI units; None without a standard error. Raises InputError for a rig without a base.
     """
-    document = _document_of(rig)
+    document = document_of(rig)
     if document.over is None:
         raise InputError(
             f"{document.source} must be a fitted rig with a `base`; `era calibrate` and "
             "`era rig identify` write one"
         )
     base = rig_of(read_document(base_path(document.over)))
-    base_document = _document_of(base)
+    base_document = document_of(base)
     section = Validation(base_document, RigSection).finish()
     base_values = dict(_leaves(base_document.data))
     base_values |= _leaves(_nested(_values(base, section)))
@@ -216,7 +216,7 @@ def _name_below(output: Path, base: Path) -> str | None:
     return base_file.relative_to(folder).as_posix()
 
 
-def _document_of(rig: Rig) -> Document:
+def document_of(rig: Rig) -> Document:
     """Return the document that a rig was built from; raises InputError without one."""
     if rig.document is None:
         raise InputError("rig must be read from a file or made by era.rig, got one without keys")
@@ -466,7 +466,7 @@ def document_for(rig: Rig) -> Document:
 
     For a fitted rig it contains plate, ERAs, masses and uncertainty.
     """
-    document = _document_of(rig)
+    document = document_of(rig)
     before = rig_of(document)
     if before == rig:
         return document

@@ -132,6 +132,14 @@ class LocalizationTable(TableRecord):
         fields = self.unit_fields(self.cell_centers).transpose(2, 0, 1) / self.thresholds[:, None]
         return decibels(highest_levels(fields[:, None]).astype(float))
 
+    def reachable_db_sl(self, points: FloatArray) -> FloatArray:
+        """Highest level [dB SL] at points (p, 2) [m] with all ERAs at full amplitude, (f, p).
+
+        Their phases make the fields add up at each point. On the nominal plate, without fingers.
+        """
+        highest = np.abs(self.unit_fields(points)).sum(axis=1)
+        return decibels(highest / self.thresholds[:, None])
+
     @cached_property
     def cell_centers(self) -> FloatArray:
         """Centers of the grid's cells [m] that are on the plate, (cells, 2)."""

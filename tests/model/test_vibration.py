@@ -31,6 +31,7 @@ from model.rig.rig_mesh import mesh_of
 from model.vibration import (
     Excitation,
     Tone,
+    damped_modes,
     default_frequencies,
     meshes_to_compare,
     peak_acceleration,
@@ -183,6 +184,24 @@ def test_plate_map_refuses_invalid_excitations(
     """No ERA, a foreign ERA, no frequency, or a frequency that the mesh cannot carry."""
     with pytest.raises(InputError, match=message):
         plate_map(coarse_rig, excitation)
+
+
+def test_damped_modes_of_a_rigid_plate_follow_from_springs_and_dampers() -> None:
+    """By hand: it heaves at sqrt(4 k / m) with the ratio of its ERAs, and tilts sqrt(3) higher.
+
+    Both tilts have sqrt(3) times the heave's damping ratio: dampers and springs are at the corners.
+    """
+    rig = make_paper_rig(12, 9, damping_ratio=0.05)
+    stiff = replace(rig.plate.material, E=1e5 * rig.plate.material.E)
+    rigid = replace(rig, plate=replace(rig.plate, material=stiff))
+
+    modes = damped_modes(rigid)
+
+    heave = math.sqrt(4 * 17e3 / rig.plate.mass) / (2 * math.pi)
+    tilt = math.sqrt(3) * heave
+    assert modes.natural_frequencies == pytest.approx([heave, tilt, tilt], rel=1e-3)
+    tilt_damping = math.sqrt(3) * 0.05
+    assert modes.damping_ratios == pytest.approx([0.05, tilt_damping, tilt_damping], rel=1e-2)
 
 
 # Fingertips

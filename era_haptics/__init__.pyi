@@ -16,6 +16,7 @@ from era_haptics.lab.design.design_run import design as design
 from era_haptics.lab.design.results import Assessment as Assessment
 from era_haptics.lab.design.results import Design as Design
 from era_haptics.lab.design.results import RankedLayout as RankedLayout
+from era_haptics.lab.rig_page.html_page import page as page
 from era_haptics.plates import SolvedPlate as SolvedPlate
 from era_haptics.plates import draw_answer as draw_answer
 from era_haptics.plates import draw_contents as draw_contents

@@ -12,6 +12,7 @@ from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.measuring.measure_cli import measure, outputs
 from era_haptics.lab.measuring.rig_cli import rig_app
+from era_haptics.lab.rig_page.page_cli import page
 from model.errors import InputError
 
 
@@ -52,10 +53,14 @@ def report(
 amp = typer.Typer()
 amp.command()(conformance)
 
+plate = typer.Typer()
+plate.command()(page)
+
 app = typer.Typer()
 app.add_typer(amp, name="amp")
 app.add_typer(content_app, name="content")
 app.add_typer(layout_app, name="layout")
+app.add_typer(plate, name="plate")
 app.add_typer(rig_app, name="rig")
 app.add_typer(design_app)
 for _command in (play, report, measure, outputs):

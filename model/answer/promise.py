@@ -148,7 +148,15 @@ def with_tones(
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
     ringing = RingingUnderFingers.of_streams(table, contents)
     drive_tones = DriveTones(rows, np.array(weights, dtype=np.complex64), owners)
-    tones = promised(fingers, contents, drive_tones, gains=gains, ringing=ringing, ways=ways)
+    tones = promised(
+        fingers,
+        contents,
+        drive_tones,
+        is_apart=answer.tones.is_apart,
+        gains=gains,
+        ringing=ringing,
+        ways=ways,
+    )
     stroke_factor = tones.stroke_factor if gains is None else answer.stroke_factor
     return replace(answer, tones=replace(tones, stroke_factor=stroke_factor))
 

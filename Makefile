@@ -59,8 +59,8 @@ nightly: .venv/installed-test
 # cases of heavy tests that `make test` leaves out.
 test-long: .venv/installed-test
 	.ci/install caddy:caddy nginx:nginx openssl:openssl calculix-ccx:ccx
-	$(BIN)/pytest -m 'long and not alone' --numprocesses auto
-	$(BIN)/pytest -m 'long and alone'
+	$(BIN)/pytest --verbose -m 'long and not alone' --numprocesses auto
+	$(BIN)/pytest --verbose -m 'long and alone'
 
 # A short form of the whole suite on a machine that has no time: what talks to wires, processes and
 # clients, beside six processes that compute without pause.

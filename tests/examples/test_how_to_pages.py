@@ -73,7 +73,7 @@ def test_page_commands_print_what_is_shown(name: str, tmp_path: Path, installed:
     In a checkout with examples and firmware alone; `pip` installs prebuilt packages.
     """
     steps, folder = read_steps(PAGES / f"{name}.md"), tmp_path / "checkout"
-    assert sum(step.shown is not None for step in steps) >= 2
+    assert any(step.shown is not None for step in steps)
     for part in ("examples", "firmware"):
         shutil.copytree(ROOT / part, folder / part)
     with tempfile.TemporaryDirectory(prefix="era") as short:

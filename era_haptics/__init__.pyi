@@ -6,6 +6,7 @@ from controller.api.jsonrpc import RpcError as RpcError
 from controller.api.link import LeaseLost as LeaseLost
 from controller.api.link import Notification as Notification
 from controller.api.link import Unreachable as Unreachable
+from controller.demo.simulated_plate import FingerVibration as FingerVibration
 from drivers.by_hand.actions import BlockingAmplifier as BlockingAmplifier
 from drivers.errors import CommandError as CommandError
 from drivers.errors import CommandRefused as CommandRefused
@@ -17,6 +18,8 @@ from era_haptics.lab.design.results import Assessment as Assessment
 from era_haptics.lab.design.results import Design as Design
 from era_haptics.lab.design.results import RankedLayout as RankedLayout
 from era_haptics.lab.rig_page.html_page import page as page
+from era_haptics.panel import SimulatedPanel as SimulatedPanel
+from era_haptics.panel import simulated_panel as simulated_panel
 from era_haptics.plates import SolvedPlate as SolvedPlate
 from era_haptics.plates import draw_answer as draw_answer
 from era_haptics.plates import draw_contents as draw_contents

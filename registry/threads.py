@@ -21,7 +21,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 CLOSE_TIMEOUT = 0.7
 """Maximum time to close a device [s]. A remote device takes 0.4 s; a program has 1 s to end."""
@@ -140,6 +140,20 @@ async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
             await in_thread(close, name=name)
     except TimeoutError:
         _logger.warning("%s: still closing after %g s, continuing without it", name, CLOSE_TIMEOUT)
+
+
+class LoopRunner(Protocol):
+    """Runs coroutines in an event loop that lives in another thread."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it runs coroutines."""
+
+    def run(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Run a coroutine and wait for its result; cancel it on Ctrl-C."""
+
+    def close(self) -> None:
+        """End the thread."""
 
 
 class LoopThread:

@@ -9,7 +9,8 @@ import asyncio
 import math
 import selectors
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from registry import threads
@@ -97,3 +98,37 @@ class _JumpingSelector(selectors.DefaultSelector):
         next_timer = self._loop._scheduled[0].when()  # type: ignore[attr-defined]
         self._loop.now = max(self._loop.now, next_timer)
         return ready
+
+
+class VirtualLoopRunner:
+    """Virtual-time loop in a thread of its own, in which time passes only while it runs work.
+
+    Between two calls all its tasks stand still, for as long as the caller takes.
+    """
+
+    def __init__(self) -> None:
+        self.is_open = True
+        """Whether it runs coroutines."""
+        self._loop = VirtualTimeLoop()
+        # A notebook has a running loop in its own thread.
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="virtual time")
+
+    def run(self, work: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine and wait for its result; cancel it on Ctrl-C."""
+        result = asyncio.run_coroutine_threadsafe(work, self._loop)
+        running = self._thread.submit(self._run_until_done, result)
+        try:
+            return running.result()
+        except BaseException:
+            result.cancel()
+            raise
+
+    def _run_until_done(self, result: "Future[T]") -> T:
+        return self._loop.run_until_complete(asyncio.wrap_future(result, loop=self._loop))
+
+    def close(self) -> None:
+        """End the thread."""
+        if self.is_open:
+            self.is_open = False
+            self._thread.submit(self._loop.close).result()
+            self._thread.shutdown()

@@ -77,7 +77,7 @@ from controller.api.methods import (
 from controller.api.schema import ApiMessage, Empty, Topic
 from controller.api.silencing import readable_params
 from model.errors import InputError
-from registry.threads import LoopThread, pauses
+from registry.threads import LoopRunner, LoopThread, pauses
 
 MAX_QUEUED_EVENTS = 1000  # waiting to be read; the oldest is dropped
 _TOUCH_INTERVAL = 0.05  # s; a finger counts as lifted 150 ms after its last report
@@ -557,9 +557,12 @@ def _blocking(
 
 
 class Client(AbstractContextManager["Client"]):
-    """A client of the daemon, returned by `connect`; its methods are thread-safe."""
+    """A client of the daemon, returned by `connect`; its methods are thread-safe.
 
-    def __init__(self, client: AsyncClient, loop: LoopThread) -> None:
+    loop: runs the asynchronous client.
+    """
+
+    def __init__(self, client: AsyncClient, loop: LoopRunner) -> None:
         self.path = client.path
         self._client = client
         self._loop = loop

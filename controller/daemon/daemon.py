@@ -68,6 +68,7 @@ class Daemon:
     observe: adds observers of the control loop.
     lines: makes the lines to the amplifiers.
     watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
+    handles_signals: whether signals end it or reload it; only in the main thread.
 
     Its parts are the attributes `controller`, `supervisor`, `publisher`, `layouts`, `inputs`, `api`
     and `server`.
@@ -85,12 +86,14 @@ class Daemon:
         observe: Callable[[Observers], None] = lambda loop: None,
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
+        handles_signals: bool = True,
     ) -> None:
         rendered_config = config.for_table(table.frequencies)
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
         self._shows_token = shows_token
+        self._handles_signals = handles_signals
         self._gateway: asyncio.Task[None] | None = None
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
@@ -161,9 +164,11 @@ class Daemon:
         """
         loop = asyncio.get_running_loop()
         loop.set_default_executor(DaemonThreads())
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
-        loop.add_signal_handler(signal.SIGHUP, self._config_reload.request)
+        if self._handles_signals:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                cause = f"{signal.strsignal(number)} received"
+                loop.add_signal_handler(number, self.shut_down, cause)
+            loop.add_signal_handler(signal.SIGHUP, self._config_reload.request)
         reloading = asyncio.create_task(self._config_reload.run(), name="reloads")
         running: asyncio.Task[None] | None = None
         try:

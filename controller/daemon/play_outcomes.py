@@ -1,10 +1,11 @@
 """Outcomes of the effects that clients request: when they start and at which level, or why not."""
 
 import asyncio
+from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any, Literal, cast
 
 from controller.api.methods import OtherFinger, PlayResult
-from controller.api.schema import headline
 from controller.daemon.plate_view import PlateView, finite
 from controller.effects.player import EffectPlayer, Play
 from controller.operation.operation_states import DaemonState
@@ -49,14 +50,13 @@ class PlayOutcomes:
                         return outcome
                     self._changed.clear()
                     await self._changed.wait()
-        return PlayResult(outcome="pending", reason=self._reason_at(contact))
+        return _not_played("pending", self._reason_at(contact))
 
     def _outcome(self, play: Play, contact: Contact, targets: list[Target]) -> PlayResult | None:
         """Return the outcome of a play with these targets so far; None while it is undecided."""
         operation = self._supervisor.operation
         if operation.state is not DaemonState.OPERATION_ENABLED:
-            reason = headline(operation.state.value, operation.cause)
-            return PlayResult(outcome="held back", reason=reason)
+            return _not_played("held back", operation.cause)
         planner = self._cycle.planner
         selection = None if planner is None else planner.selection
         if planner is not None and selection is not None:
@@ -65,11 +65,11 @@ class PlayOutcomes:
                 return decided
         now = threads.now()
         if any(_is_late(target, now) for target in targets):
-            return PlayResult(outcome="late", reason=self._silence_reason or _LATE)
+            return _not_played("late", self._silence_reason or _LATE)
         if not self._player.is_active(play, contact.key):
-            return PlayResult(outcome="held back", reason=_ENDED)
+            return _not_played("held back", _ENDED)
         if play.targets == () and not targets:  # it begins with a pause, or waits for a movement
-            return PlayResult(outcome="pending", reason=play.why_paused)
+            return _not_played("pending", play.why_paused)
         return None
 
     def _decided(
@@ -91,11 +91,8 @@ class PlayOutcomes:
         )
         for unserved in selection.unserved:
             if is_decided and unserved.contact.key == contact.key:
-                return PlayResult(
-                    outcome="held back",
-                    reason=unserved.held_back,
-                    other_fingers=_other_fingers(selection, contact),
-                )
+                others = _other_fingers(selection, contact)
+                return _not_played("held back", unserved.held_back, others)
         return None
 
     def _start_of(self, planner: Planner, content: Content) -> float | None:
@@ -143,12 +140,26 @@ def _is_late(target: Target, now: float) -> bool:
     return pulse is not None and pulse.started_at is None and now >= pulse.end
 
 
+def _not_played(
+    outcome: Literal["late", "held back", "pending"],
+    reason: str | None,
+    other_fingers: Sequence[OtherFinger] = (),
+) -> PlayResult:
+    """Return the outcome of a play that does not start, or not yet."""
+    return PlayResult(
+        outcome=outcome,
+        reason=reason,
+        promised_contrast_db=None,
+        other_fingers=[*other_fingers],
+    )
+
+
 def _played(selection: Selection, felt: FingerSensation, start: float) -> PlayResult:
     """Return the outcome of a play whose content starts at a time [s]."""
     sensation = felt.sensation
     other_fingers = _other_fingers(selection, felt.contact)
     if sensation.verdict == HELD_BACK:
-        return PlayResult(outcome="held back", reason=felt.held_back, other_fingers=other_fingers)
+        return _not_played("held back", felt.held_back, other_fingers)
     return PlayResult(
         outcome="played",
         reason=felt.held_back,
@@ -157,7 +168,7 @@ def _played(selection: Selection, felt: FingerSensation, start: float) -> PlayRe
         level_db_sl=finite(sensation.level_db_sl),
         promised_level_db_sl=finite(sensation.promised_level_db_sl),
         promised_contrast_db=finite(sensation.promised_contrast_db),
-        verdict=sensation.verdict,
+        verdict=cast(Any, sensation.verdict),
         other_fingers=other_fingers,
     )
 

@@ -200,14 +200,14 @@ async def run_demo(
     is_real_time = not isinstance(asyncio.get_running_loop(), VirtualTimeLoop)
     touches = RecordedTouches()
     recorded = _RecordedInput("recorded", "recorded:", ALIGNED, touches)
-    simulated = _on_simulated_plate(
+    simulated = on_simulated_plate(
         rig_file,
         {"socket": "era.sock"},
         layouts=[scene.layout for scene in scenes],
         wire=wire,
         seed=seed,
     )
-    with _log_errors_only():
+    with log_errors_only():
         async with simulated as (config, lock, plate):
             try:
                 async with asyncio.TaskGroup() as tasks:
@@ -253,7 +253,7 @@ async def run_live(
     log = start_log(None, level="warning")
     try:
         layout = example_layout(load_rig(rig_file))
-        async with _on_simulated_plate(rig_file, {}, layouts=[layout], wire=wire, seed=seed) as (
+        async with on_simulated_plate(rig_file, {}, layouts=[layout], wire=wire, seed=seed) as (
             config,
             lock,
             _,
@@ -273,7 +273,7 @@ async def run_live(
 
 
 @contextlib.contextmanager
-def _log_errors_only() -> Iterator[None]:
+def log_errors_only() -> Iterator[None]:
     """Log errors to standard error and no warnings, which rows and causes report."""
     handler = logging.StreamHandler()
     handler.setLevel(logging.ERROR)
@@ -286,7 +286,7 @@ def _log_errors_only() -> Iterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def _on_simulated_plate(
+async def on_simulated_plate(
     rig_file: Path,
     daemon_keys: Mapping[str, object],
     *,
@@ -356,7 +356,7 @@ async def play_scenes(
     await daemon.started.wait()
     async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
         try:
-            await _wait_until_ready(era)
+            await wait_until_ready(era)
             async with era.armed("the demonstration", lease_s=MAX_LEASE):
                 recorder.start()
                 for number, scene in enumerate(scenes):
@@ -369,13 +369,13 @@ async def play_scenes(
             raise LinkError(f"demonstration aborted: {error}") from error
 
 
-async def _wait_until_ready(era: AsyncClient) -> None:
+async def wait_until_ready(era: AsyncClient) -> None:
     """Wait until the daemon can be armed; raises LinkError after `READY_TIMEOUT`."""
     end = threads.now() + READY_TIMEOUT
     status = await era.status()
     while status.state != DaemonState.READY_TO_SWITCH_ON:
         if threads.now() > end:
-            raise LinkError(f"demonstration aborted: {status.cause}")
+            raise LinkError(f"simulated amplifiers: not ready: {status.cause}")
         await asyncio.sleep(_PAUSE)
         status = await era.status()
 

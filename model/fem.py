@@ -377,10 +377,10 @@ class PlateMatrices:
 def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
     """Assemble stiffness and mass of the free plate.
 
-    Raises InputError for a mesh of another plate, and for a plate of layers or with air behind it.
+    Raises InputError for a mesh of another plate, and for a plate of layers or with air.
     """
-    if plate.is_layered:
-        what = "a laminate" if plate.laminate is not None else "a plate with an air gap"
+    if plate.needs_polynomials:
+        what = "a laminate" if plate.laminate is not None else "a plate with air"
         raise InputError(
             f"mesh: must be of polynomials for {what}, got {mesh}; finite elements are for "
             "homogeneous plates in a vacuum: use mesh auto, or Legendre with degrees"

@@ -289,9 +289,9 @@ def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalM
 def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
     """Solve the modes with finite elements; their shapes are known at the nodes."""
     check_is_plate(rig.plate, "simply-supported modes")
-    if rig.plate.is_layered:
+    if rig.plate.needs_polynomials:
         raise InputError(
-            "support must be free or eras for a plate of layers or with an air gap, got "
+            "support must be free or eras for a plate of layers or with air, got "
             "simply-supported, which only finite elements solve"
         )
     if not isinstance(mesh, Mesh):
@@ -356,7 +356,7 @@ class Convergence:
 def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own.
 
-    A plate with layers or an air gap is solved with polynomials only; then there are three degrees
+    A plate with layers or air is solved with polynomials only; then there are three degrees
     in place of meshes of elements.
     """
     plate, high = rig.plate, rig.limits.frequency_max
@@ -364,7 +364,7 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     stiffness = rig.largest_stiffness
     foot = min(era.foot for era in rig.eras)
     automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness, foot=foot)
-    if plate.is_layered and isinstance(automatic, SpectralMesh):
+    if plate.needs_polynomials and isinstance(automatic, SpectralMesh):
         lowest = automatic.resolving(plate, high)
         return tuple(dict.fromkeys([lowest, automatic, automatic.finer(), rig.mesh]))
     size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
@@ -421,7 +421,9 @@ def study_convergence(
         of_frequencies = _natural_frequencies(rig, free)[supported] / exact[supported] - 1
         errors.append(MeshError(mesh, of_frequencies, found, estimate))
     progress(1 + len(meshes), 1 + len(meshes))
-    accurate = rig.mesh if rig.plate.is_layered else Mesh.accurate(rig.plate, frequency_max=high)
+    accurate = (
+        rig.mesh if rig.plate.needs_polynomials else Mesh.accurate(rig.plate, frequency_max=high)
+    )
     plain = _solved(rig, accurate)
     before = response(plain, rig.eras)
     length, width = sides
@@ -455,7 +457,7 @@ def _relative_error(found: ComplexArray, exact: ComplexArray) -> FloatArray:
 def _reference(rig: Rig) -> PlateMesh:
     """Return the reference mesh: elements, or polynomials for a plate with layers."""
     high = rig.limits.frequency_max
-    if not rig.plate.is_layered:
+    if not rig.plate.needs_polynomials:
         return reference_mesh(rig.plate, frequency_max=high)
     automatic = mesh_of("auto", rig.plate, frequency_max=high)
     return replace(automatic, nx=2 * automatic.nx, ny=2 * automatic.ny)

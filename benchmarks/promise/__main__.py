@@ -1,7 +1,7 @@
 """Promised and felt contrast on plates within the tolerances: docs/measured/promise.md.
 
     python -m benchmarks.promise [--cases 1,2] [--plates 60] [--first 0] [--workers 2]
-    python -m benchmarks.promise contents|clicks|everyday|weather [--sets N] [--plates N]
+    python -m benchmarks.promise contents|clicks|everyday|weather|air [--sets N] [--plates N]
 
 Without a subcommand, it runs sessions through the complete signal chain, by case number. Each
 session has its own plate, ERAs, drives and fingertips, drawn within the uncertainty of the rig.
@@ -11,7 +11,7 @@ is simulated in time under the fingers. Exits with status 1 unless 80 to 98 % of
 kept, both of default and of identified rigs.
 
 contents: by number of ERAs. clicks: without the wire. everyday: hands, force, objects and people;
---only WORD ... selects rows. weather: after a change of weather.
+--only WORD ... selects rows. weather: after a change of weather. air: with air around the plate.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
-from benchmarks.promise import clicks, contents, everyday, weather
+from benchmarks.promise import air, clicks, contents, everyday, weather
 from benchmarks.promise.cases import CASES
 from benchmarks.promise.report import as_markdown, kept
 from benchmarks.promise.session import Outcome, outcome
@@ -35,7 +35,7 @@ def main() -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parts = ("sessions", "contents", "clicks", "everyday", "weather")
+    parts = ("sessions", "contents", "clicks", "everyday", "weather", "air")
     parser.add_argument("part", nargs="?", choices=parts, default="sessions")
     parser.add_argument("--cases", help="numbers of sessions from 0; default: all")
     parser.add_argument("--first", type=int, default=0, help="seed of the first plate")
@@ -52,6 +52,8 @@ def main() -> None:
         everyday.run(options.sets or 20, options.plates or 60, options.only)
     elif options.part == "weather":
         weather.run(options.sets or 16, options.plates or 40)
+    elif options.part == "air":
+        air.run(options.sets or 24, options.plates or 40)
     else:
         numbers = list(range(len(CASES)))
         if options.cases:

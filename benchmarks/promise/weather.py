@@ -94,13 +94,13 @@ def _promised_and_kept(table: LocalizationTable, material: Material, sets: int, 
         best = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
         drawn = draw_plates(rng, material.known, count=plates, of=table, contact_count=2)
         promised = np.array([each.promised_contrast_db for each in best.fingers], dtype=float)
-        felt = _contrasts(table, best, positions, material.changed(drawn))
+        felt = contrasts_on(table, best, positions, material.changed(drawn))
         promises.append(promised.min())
         kept.append(felt >= promised[:, None])
     return f"{np.median(promises):.1f} dB, {100 * np.mean(kept):.0f} %"
 
 
-def _contrasts(
+def contrasts_on(
     table: LocalizationTable,
     best: Answer,
     positions: Sequence[tuple[float, float]],

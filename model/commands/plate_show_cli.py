@@ -123,7 +123,7 @@ def _homogeneous_rows(summary: dict[str, Any]) -> Iterator[str]:
         if value:
             yield f"    {name.replace('_', ' ')}  {in_display_unit(value, dimension.unit)}"
     if summary["surface"] is None:
-        yield from _air_rows(summary["air_gap"])
+        yield from _air_rows(summary)
     for key, wavelength in summary["bending_wavelength_m"].items():
         yield f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
 
@@ -146,10 +146,15 @@ def in_gpa(moduli: dict[str, float]) -> str:
     return f"{', '.join(f'{key} {value / 1e9:.4g}' for key, value in moduli.items())} GPa"
 
 
-def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
-    """Yield the air gap behind a plate."""
+def _air_rows(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the open air around a plate, and the air gap behind it."""
+    air = summary["air_gap"]
+    if summary["air"] != "none":
+        grams = 1e3 * summary["air_mass_kg"]
+        yield f"    air  {summary['air']}, adds {grams:.3g} g to the plate moving up and down"
+    elif air is None:
+        yield "    no air: computed in a vacuum"
     if air is None:
-        yield "    no air_gap: computed in a vacuum"
         return
     edges = "sealed" if air["closed"] else "open"
     yield f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}"

@@ -48,7 +48,15 @@ from model.structure.material import (
     known_material,
     material_names,
 )
-from model.structure.plate import MAX_LOSS_EXPONENT, AirGap, Bond, Laminate, LaminateLayer, Plate
+from model.structure.plate import (
+    MAX_LOSS_EXPONENT,
+    AirGap,
+    Bond,
+    Laminate,
+    LaminateLayer,
+    Plate,
+    SurroundingAir,
+)
 from model.structure.surface import (
     NU,
     THICKNESS,
@@ -282,6 +290,9 @@ class PlateSection(Section):
     bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
     """Bond between the layers; see [laminates](#laminates)."""
 
+    air: Literal["none", "front", "both sides"] = "none"
+    """Open air that moves with the plate; see [air](#air)."""
+
     air_gap: AirGapSection | None = None
     """Air between the plate and a rigid wall behind it; see [air_gap](#air_gap).
 
@@ -373,6 +384,8 @@ class PlateSection(Section):
         values["mode_deviations"] = tuple(
             (2 * math.log(frequency), math.log(loss)) for frequency, loss in self.modes
         )
+        if self.air != "none":
+            values["air"] = SurroundingAir(self.air)
         if self.air_gap is not None:
             values["air_gap"] = AirGap(**self.air_gap.model_dump())
         laminate = self.laminate
@@ -415,6 +428,7 @@ class PlateSection(Section):
             for number, layer in enumerate(layers):
                 values["layers", number, "material"] = MaterialSection.keys_of(layer.material)
                 values["layers", number, "thickness"] = layer.thickness
+        values["air",] = "none" if plate.air is None else plate.air.value
         if self.air_gap is not None and plate.air_gap is not None:
             for key, value in asdict(plate.air_gap).items():
                 values["air_gap", key] = value

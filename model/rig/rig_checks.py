@@ -140,6 +140,12 @@ def _check_plate(validation: RigValidation, *, frequency_max: float) -> Plate | 
     section = validation.part(("plate",), PlateSection)
     if section is None or not has_good_materials or not chosen.required <= keys.keys():
         return None
+    if section.air == "both sides" and section.air_gap is not None:
+        validation.add(
+            ("plate", "air"),
+            "must be front or none with air_gap, which is the air behind it, got both sides",
+        )
+        return None
     try:
         laminate = section.laminate
         plate = section.build(frequency_max=frequency_max)
@@ -211,8 +217,8 @@ def _check_mesh(validation: RigValidation, plate: Plate, *, frequency_max: float
     except InputError as error:
         validation.add(("mesh",), str(error))
         return
-    if plate.is_layered and not isinstance(mesh, SpectralMesh):
-        what = "layers" if plate.laminate is not None else "an air gap"
+    if plate.needs_polynomials and not isinstance(mesh, SpectralMesh):
+        what = "layers" if plate.laminate is not None else "air"
         validation.add(
             ("mesh",),
             f"must be of polynomials for a plate with {what}, got {mesh}; use auto, or degrees "

@@ -14,6 +14,7 @@ from model.config.fields import quantities
 from model.rig.actuator_keys import ExciterSection
 from model.rig.plate_sections import PLAIN_KEYS
 from model.rig.rig import Rig
+from model.spectral.surrounding_air import heave_mass
 from model.structure.attachments import PointLoad
 from model.structure.exciter import EXCITER_TYPES, Exciter
 from model.structure.laminate_bending import (
@@ -22,9 +23,14 @@ from model.structure.laminate_bending import (
     perfectly_bonded,
     wavenumber_of,
 )
-from model.structure.plate import AirGap, Bond, Laminate, LaminateLayer, Plate
+from model.structure.plate import AirGap, Bond, Laminate, LaminateLayer, Plate, SurroundingAir
 from model.structure.surface import Surface
 from registry.limits import GuardLimits
+
+_AIR_IN_WORDS = {
+    SurroundingAir.BOTH: "air on both sides",
+    SurroundingAir.FRONT: "air in front of it",
+}
 
 FURTHER = {
     field.name: PLAIN_KEYS[field.name]
@@ -60,6 +66,8 @@ def summary_line(rig: Rig, *, verdict: str = "good") -> str:
     plate = rig.plate
     parts = [plate_in_words(rig)]
     gap = plate.air_gap
+    if plate.air is not None:
+        parts.append(_AIR_IN_WORDS[plate.air])
     if gap is not None:
         edges = "sealed" if gap.closed else "open"
         parts.append(f"{1e3 * gap.depth:g} mm of air behind it, {edges} at the edges")
@@ -121,6 +129,8 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "surface_density_kg_m2": plate.surface_density,
         "flexural_rigidity_n_m": plate.flexural_rigidity,
         "bending_wavelength_m": _at_both_limits(limits, bending_wavelength),
+        "air": "none" if plate.air is None else plate.air.value,
+        "air_mass_kg": heave_mass(plate),
         "air_gap": None if plate.air_gap is None else _air_gap_summary(plate.air_gap, limits),
         "point_masses": [_mass_summary(load) for load in rig.masses if load.mass],
         "supports": [_support_summary(load) for load in rig.masses if load.stiffness],

@@ -1,7 +1,8 @@
 """Natural modes of a plate in Legendre polynomials, one symmetry class at a time.
 
-The plate has one layer or several, with the air behind it. Displacements along the plate follow the
-deflection (`model.spectral.polynomials.follow`): only the deflection and the air vibrate.
+The plate has one layer or several, with the air around and behind it. Displacements along the plate
+follow the deflection (`model.spectral.polynomials.follow`): only the deflection and the air
+vibrate.
 
 Moduli that depend on the frequency or lose energy, and the friction of air, make modes complex.
 They are evaluated for every mode at its own natural frequency: the complex mode is solved in the
@@ -30,6 +31,7 @@ from model.spectral.polynomials import (
     edge_decays,
     follow,
 )
+from model.spectral.surrounding_air import added_mass
 from model.structure.laminate_bending import (
     interface_mass,
     opposite_motions,
@@ -172,9 +174,14 @@ class SpectralPlate:
         )
 
     def deflection_mass(self, functions: ClassFunctions) -> FloatArray:
-        """Mass between the polynomials of the deflection, (m, m)."""
+        """Mass of plate and open air between the polynomials of the deflection, (m, m)."""
         density = sum(layer.surface_density for layer in self.layers)
-        return density * np.eye(functions.deflections)
+        mass = density * np.eye(functions.deflections)
+        if self.plate.air is not None:
+            x, y = functions.x, functions.y
+            sides, degrees = (x.length, y.length), (x.degree, y.degree)
+            mass += added_mass(self.plate.air, sides, degrees, functions.parity)
+        return mass
 
     def stiffness(self, functions: ClassFunctions, moduli: Sequence[float]) -> FloatArray:
         """Return the stiffness matrix of a parity class; moduli: Young's modulus of each layer."""

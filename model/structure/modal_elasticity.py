@@ -63,7 +63,7 @@ def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
     Equal eigenvalues, for example of a square plate, keep their order.
     """
     with np.errstate(divide="ignore"):
-        order = np.argsort(np.round(np.log(eigenvalues), 9), kind="stable")
+        order = np.argsort(np.round(np.log(np.maximum(eigenvalues, 0)), 9), kind="stable")
     elastic = order[eigenvalues[order] > 0]
     return elastic[:count]
 

@@ -179,10 +179,19 @@ class Laminate:
         return replace(self, layers=tuple(layers))
 
 
+class SurroundingAir(StrEnum):
+    """Open air that moves with the plate (`model.spectral.surrounding_air`)."""
+
+    BOTH = "both sides"
+    """Around free edges, between front and back."""
+    FRONT = "front"
+    """In front of a plate that is flush with a rigid surface around it."""
+
+
 # Dry air at 20 °C and 101325 Pa (Lemmon and Jacobsen, Int. J. Thermophys. 25 (2004) 21): density
 # [kg/m³], viscosity [Pa s], thermal conductivity [W/(m K)], heat capacity [J/(kg K)], its ratio.
 PRESSURE = 101_325.0
-_DENSITY, VISCOSITY, CONDUCTIVITY = 1.204, 18.2e-6, 25.9e-3
+AIR_DENSITY, VISCOSITY, CONDUCTIVITY = 1.204, 18.2e-6, 25.9e-3
 HEAT_CAPACITY, HEAT_RATIO = 1006.0, 1.402
 
 # Depth [thicknesses of the boundary layer] down to which friction hardly couples modes, and down to
@@ -210,7 +219,7 @@ class AirGap:
         boundary layer. 0 for a deep gap, whose error is within 3 % (sealed: 5 %); then 0.1; 0.5 for
         a gap too narrow for modes, whose error is half of the response and more.
         """
-        relative_depth = self.depth / math.sqrt(VISCOSITY / (math.pi * _DENSITY * frequency))
+        relative_depth = self.depth / math.sqrt(VISCOSITY / (math.pi * AIR_DENSITY * frequency))
         deep, modal = _SEALED if self.closed else _OPEN
         if relative_depth >= deep:
             return 0.0
@@ -218,12 +227,12 @@ class AirGap:
 
     def inertia(self, frequency: float) -> complex:
         """rho b [kg/m³] at a frequency [Hz]: density of air that friction holds back."""
-        wall = self._wall_share(frequency, _DENSITY / VISCOSITY)
-        return _DENSITY / (1 - wall)
+        wall = self._wall_share(frequency, AIR_DENSITY / VISCOSITY)
+        return AIR_DENSITY / (1 - wall)
 
     def bulk_modulus(self, frequency: float) -> complex:
         """B [Pa] at a frequency [Hz]: isothermal in the slow limit, adiabatic in the fast."""
-        wall = self._wall_share(frequency, _DENSITY * HEAT_CAPACITY / CONDUCTIVITY)
+        wall = self._wall_share(frequency, AIR_DENSITY * HEAT_CAPACITY / CONDUCTIVITY)
         return HEAT_RATIO * PRESSURE / (1 + (HEAT_RATIO - 1) * wall)
 
     def _wall_share(self, frequency: float, per_frequency: float) -> complex:
@@ -294,8 +303,14 @@ class Plate(Sheet):
     Scaled like the homogeneous plate, which is up to a fifth too much for a soft adhesive.
     """
 
+    air: SurroundingAir | None = field(default=None, metadata=_scales())
+    """Open air that moves with the plate; None for a vacuum.
+
+    Scaled with the plate's mass; it changes by 0.1 % of this mass over 2 % of thickness.
+    """
+
     air_gap: AirGap | None = field(default=None, metadata=_scales())
-    """Air between the plate and a rigid wall; None for a plate in the open.
+    """Air between the plate and a rigid wall; None without a wall.
 
     Scaled like the homogeneous plate, which is a fifth too much for air of 0.5 mm or more.
     """
@@ -318,9 +333,9 @@ class Plate(Sheet):
         object.__setattr__(self, "mode_deviations", deviations)
 
     @property
-    def is_layered(self) -> bool:
-        """Whether it is solved by layers and with the air behind it, in polynomials only."""
-        return self.laminate is not None or self.air_gap is not None
+    def needs_polynomials(self) -> bool:
+        """Whether layers or air are solved with it, in polynomials only."""
+        return self.laminate is not None or self.air_gap is not None or self.air is not None
 
     def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Plate":
         """Return the plate with moduli and thickness (also of all layers) multiplied by factors."""

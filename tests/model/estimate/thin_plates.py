@@ -16,14 +16,15 @@ from scipy import linalg
 
 from model.estimate.identify import Identification
 from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.parameters import PARAMETER_KINDS
 from model.estimate.relevant_quantities import relevant
 
 Reals: TypeAlias = NDArray[np.float64]
 Complexes: TypeAlias = NDArray[np.complex128]
+Integrals: TypeAlias = dict[tuple[int, int], Reals]
+"""Integrals of a derivative of one function and one of another, by the orders of both."""
 
 ELEMENTS = (13, 10)
-LOSS_AT = 150.0  # Hz
+ORDERS = ((0, 0), (1, 1), (2, 2), (2, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,52 +39,63 @@ class Line:
         """Length of an element [m]."""
         return self.length / self.elements
 
-    def integrals(
-        self, start: float = 0.0, end: float = np.inf, *, slope: float = 0.0, power: int = 1
-    ) -> dict[tuple[int, int], Reals]:
-        """Integrals of derivative a of one function and b of another, by (a, b).
+    def integrals(self, *, margin: float, slope: float, power: int) -> Integrals:
+        """Integrals over the line without a margin [m] at both ends.
 
-        start, end [m]: of the part over which they are taken; slope, power: of a factor
-        (1 + slope u)^power, u from -1 to 1 along the line.
+        A factor (1 + slope u)^power, u from -1 to 1 along the line, is part of the integrand.
         """
         points, weights = np.polynomial.legendre.leggauss(6)
         size = 2 * (self.elements + 1)
-        found = {key: np.zeros((size, size)) for key in ((0, 0), (1, 1), (2, 2), (2, 0))}
-        for e in range(self.elements):
-            low, high = np.clip((np.array([start, end]) / self.step) - e, 0, 1)
-            t, own = low + (high - low) * (points + 1) / 2, weights / 2 * (high - low) * self.step
-            own = own * (1 + slope * (2 * (e + t) / self.elements - 1)) ** power
-            for (a, b), total in found.items():
-                local = np.einsum("q,qi,qj->ij", own, self._local(t, a), self._local(t, b))
-                total[2 * e : 2 * e + 4, 2 * e : 2 * e + 4] += local
-        return found
+        totals = {orders: np.zeros((size, size)) for orders in ORDERS}
+        span = np.array([margin, self.length - margin]) / self.step
+        for number in range(self.elements):
+            low, high = np.clip(span - number, 0, 1)
+            t = low + (high - low) * (points + 1) / 2
+            u = 2 * (number + t) / self.elements - 1
+            lengths = (high - low) * self.step * weights / 2
+            factors = lengths * (1 + slope * u) ** power
+            dofs = slice(2 * number, 2 * number + 4)
+            for (row_order, column_order), total in totals.items():
+                rows = self._local(t, row_order)
+                columns = self._local(t, column_order)
+                total[dofs, dofs] += rows.T @ (factors[:, None] * columns)
+        return totals
 
     def at(self, x: Reals) -> Reals:
         """Values of all functions at x (p,), beyond an end at it, (p, 2 nodes)."""
         x = np.clip(x, 0.0, self.length)
         element = np.clip((x / self.step).astype(int), 0, self.elements - 1)
-        values = self._local(x / self.step - element, 0)
-        found = np.zeros((len(x), 2 * (self.elements + 1)))
+        values = np.zeros((len(x), 2 * (self.elements + 1)))
         rows = np.arange(len(x))[:, None]
-        found[rows, 2 * element[:, None] + np.arange(4)] = values
-        return found
+        dofs = 2 * element[:, None] + np.arange(4)
+        values[rows, dofs] = self._local(x / self.step - element, 0)
+        return values
 
-    def _local(self, t: Reals, derivative: int) -> Reals:
-        """The four functions of an element at t in (0, 1), or a derivative, (q, 4)."""
+    def _local(self, t: Reals, order: int) -> Reals:
+        """The four functions of an element at t in (0, 1), or their derivatives, (q, 4)."""
         h = self.step
         cubics = np.array([[1, 0, -3, 2], [0, h, -2 * h, h], [0, 0, 3, -2], [0, 0, -h, h]])
-        rows = [np.polynomial.polynomial.polyder(c, derivative) for c in cubics]
-        values = [np.polynomial.polynomial.polyval(t, row) for row in rows]
-        return np.asarray(np.array(values).T / h**derivative, dtype=float)
+        columns = []
+        for cubic in cubics:
+            derivative = np.polynomial.polynomial.polyder(cubic, order)
+            columns.append(np.polynomial.polynomial.polyval(t, derivative))
+        return np.asarray(np.array(columns).T / h**order, dtype=float)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame along the edges: its width [m], and what it adds to rigidity and mass, relative."""
+
+    width: float = 12e-3
+    rigidity: float = 0.8
+    mass: float = 0.35
 
 
 @dataclass(frozen=True, eq=False)
 class ThinPlate:
     """A free plate: sides, thickness [m], E [Pa], rho [kg/m³], nu.
 
-    parts: x from, to, y from, to [m] of parts that are stiffer and heavier, and what they have of
-    rigidity and of mass beside the plate's, relative; taper: thickness that each side's ends have
-    more or less than its middle, relative.
+    taper: thickness that each side's ends have more or less than its middle, relative.
     """
 
     length: float
@@ -92,80 +104,64 @@ class ThinPlate:
     modulus: float
     density: float
     ratio: float
-    parts: tuple[tuple[float, ...], ...] = ()
     taper: tuple[float, float] = (0.0, 0.0)
+    frame: Frame | None = None
 
     @cached_property
     def _lines(self) -> tuple[Line, Line]:
-        return Line(self.length, ELEMENTS[0]), Line(self.width, ELEMENTS[1])
+        along, across = ELEMENTS
+        return Line(self.length, along), Line(self.width, across)
 
     @cached_property
     def modes(self) -> tuple[Reals, Reals]:
         """Eigenvalues omega² (r,) [rad²/s²] and modes (size, r) of modal mass 1."""
-        along, across = self._lines
-        lines = list(zip(self._lines, self.taper, strict=True))
-        x, y = (line.integrals(slope=slope, power=3) for line, slope in lines)
-        mass_x, mass_y = (line.integrals(slope=slope)[0, 0] for line, slope in lines)
+        stiffness, mass = self._matrices(margin=0.0)
+        if self.frame is not None:
+            inner_stiffness, inner_mass = self._matrices(margin=self.frame.width)
+            stiffness = stiffness + self.frame.rigidity * (stiffness - inner_stiffness)
+            mass = mass + self.frame.mass * (mass - inner_mass)
         rigidity = self.modulus * self.thickness**3 / 12 / (1 - self.ratio**2)
-        stiffness, mass = self._bending(x, y), np.kron(mass_x, mass_y)
-        for *place, stiffer, heavier in self.parts:
-            of_x, of_y = along.integrals(*place[:2]), across.integrals(*place[2:])
-            stiffness = stiffness + stiffer * self._bending(of_x, of_y)
-            mass = mass + heavier * np.kron(of_x[0, 0], of_y[0, 0])
-        mass = self.density * self.thickness * mass
-        values, vectors = linalg.eigh(rigidity * stiffness, mass)
+        surface_density = self.density * self.thickness
+        values, vectors = linalg.eigh(rigidity * stiffness, surface_density * mass)
         values[:3] = 0.0
         return values, vectors
 
-    def _bending(self, x: dict[tuple[int, int], Reals], y: dict[tuple[int, int], Reals]) -> Reals:
-        """Stiffness at a rigidity of 1, by integrals along both sides."""
-        nu, mixed = self.ratio, np.kron(x[2, 0], y[2, 0].T)
-        stiffness = np.kron(x[2, 2], y[0, 0]) + np.kron(x[0, 0], y[2, 2])
-        twist = 2 * (1 - nu) * np.kron(x[1, 1], y[1, 1])
-        return np.asarray(stiffness + nu * (mixed + mixed.T) + twist)
-
-    def thinned(self, factor: float) -> "ThinPlate":
-        """The plate with its thickness times a factor, whose modes scale exactly."""
-        values, vectors = self.modes
-        thinner = replace(self, thickness=factor * self.thickness)
-        thinner.__dict__["modes"] = (factor**2 * values, vectors / np.sqrt(factor))
-        return thinner
+    def _matrices(self, *, margin: float) -> tuple[Reals, Reals]:
+        """Stiffness at a rigidity of 1 and mass at a density of 1, without a margin [m]."""
+        bending, inertia = [], []
+        for line, slope in zip(self._lines, self.taper, strict=True):
+            bending.append(line.integrals(margin=margin, slope=slope, power=3))
+            inertia.append(line.integrals(margin=margin, slope=slope, power=1)[0, 0])
+        x, y = bending
+        mixed = np.kron(x[2, 0], y[2, 0].T)
+        bent = np.kron(x[2, 2], y[0, 0]) + np.kron(x[0, 0], y[2, 2])
+        bent += self.ratio * (mixed + mixed.T)
+        twisted = 2 * (1 - self.ratio) * np.kron(x[1, 1], y[1, 1])
+        return np.asarray(bent + twisted), np.asarray(np.kron(*inertia))
 
     def shapes(self, points: Reals) -> Reals:
         """Mode shapes at points (p, 2) [m], (p, r)."""
-        along = [line.at(points[:, axis]) for axis, line in enumerate(self._lines)]
-        functions = along[0][:, :, None] * along[1][:, None, :]
-        return np.asarray(functions.reshape(len(points), -1) @ self.modes[1])
+        along, across = self._lines
+        x_functions, y_functions = along.at(points[:, 0]), across.at(points[:, 1])
+        products = x_functions[:, :, None] * y_functions[:, None, :]
+        _, vectors = self.modes
+        return np.asarray(products.reshape(len(points), -1) @ vectors)
 
 
 @dataclass(frozen=True, eq=False)
 class Mounted:
     """A plate on n ERAs with masses.
 
-    at (n, 2) [m]; stiffness, damping, bolt, gain (n,); masses (m, 3): x, y [m] and mass [kg];
-    loss: factor at LOSS_AT, loss_exponent of its power of frequency.
+    at (n, 2) [m]; stiffness, damping, gain (n,); masses (m, 3): x, y [m] and mass [kg].
     """
 
     plate: ThinPlate
     at: Reals
     stiffness: Reals
     damping: Reals
-    bolt: Reals
     gain: Complexes
     masses: Reals
     loss: float
-    loss_exponent: float
-
-    @cached_property
-    def attached(self) -> Reals:
-        """Mode shapes at ERAs and masses (n + m, r)."""
-        return self.plate.shapes(np.vstack([self.at, self.masses[:, :2]]))
-
-    def receptance(self, frequency: float) -> Complexes:
-        """Of each mode of the free plate, (r,)."""
-        w, values = 2 * np.pi * frequency, self.plate.modes[0]
-        loss = self.loss * (frequency / LOSS_AT) ** self.loss_exponent
-        return np.asarray(1 / (values + 1j * loss * w * np.sqrt(values) - w**2))
 
     def accelerations(
         self,
@@ -173,187 +169,130 @@ class Mounted:
         points: Reals,
         *,
         fingers: Reals | None = None,
-        loads: Complexes | None = None,
     ) -> Complexes:
         """Acceleration at points (p, 2) per base displacement of each ERA, its gain included.
 
-        (p, n) [1/s²]; fingers (k, 2) [m] with dynamic stiffness loads (k,) [N/m].
+        (p, n) [1/s²]; fingers (k, 2) [m].
         """
-        w, n = 2 * np.pi * frequency, len(self.at)
+        w, count = 2 * np.pi * frequency, len(self.at)
         base = self.stiffness + 1j * w * self.damping
-        held: list[Complexes | Reals] = [base - w**2 * self.bolt, -(w**2) * self.masses[:, 2]]
-        shapes = self.attached
-        if fingers is not None and loads is not None:
-            shapes = np.vstack([shapes, self.plate.shapes(fingers)])
-            held.append(loads)
-        Z = np.concatenate(held)
-        modal = self.receptance(frequency)
-        system = np.eye(len(Z)) + Z[:, None] * ((shapes * modal) @ shapes.T)
-        applied = np.zeros((len(Z), n), dtype=complex)
-        applied[np.arange(n), np.arange(n)] = base * self.gain
+        places = [self.at, self.masses[:, :2]]
+        attached = [base, -(w**2) * self.masses[:, 2]]
+        if fingers is not None:
+            places.append(fingers)
+            attached.append(np.full(len(fingers), finger_stiffness(frequency)))
+        dynamic_stiffness = np.concatenate(attached)
+        shapes = self.plate.shapes(np.vstack(places))
+        eigenvalues, _ = self.plate.modes
+        receptances = 1 / (eigenvalues + 1j * self.loss * w * np.sqrt(eigenvalues) - w**2)
+        compliance = (shapes * receptances) @ shapes.T
+        system = np.eye(len(shapes)) + dynamic_stiffness[:, None] * compliance
+        applied = np.zeros((len(shapes), count), dtype=complex)
+        np.fill_diagonal(applied, base * self.gain)
         forces = np.linalg.solve(system, applied)
-        return np.asarray(-(w**2) * (self.plate.shapes(points) * modal) @ (shapes.T @ forces))
+        at_points = self.plate.shapes(points) * receptances
+        return np.asarray(-(w**2) * at_points @ (shapes.T @ forces))
+
+
+def finger_stiffness(frequency: float) -> complex:
+    """Force per displacement of a finger: a contact mass on a pulp, a phalanx on its joint."""
+    w = 2 * np.pi * frequency
+    pulp = 1000.0 + 2.0j * w  # N/m
+    joint = 500.0 + 2.0j * w
+    phalanx_share = pulp / (pulp + joint - w**2 * 5e-3)
+    return complex(pulp * (1 - phalanx_share) - w**2 * 2e-4)
 
 
 LENGTH, WIDTH, THICKNESS = 0.3048, 0.2286, 0.0015
 MODULUS, DENSITY, RATIO = 70e9, 2700.0, 0.33
 STIFFNESS, DAMPING_RATIO, LOSS = 17_000.0, 0.05, 0.01
 CORNERS = np.array([(0, 0), (LENGTH, 0), (LENGTH, WIDTH), (0, WIDTH)])
-FAMILY = ("plain", "form", "hard", "uneven")
-SETS = (*FAMILY, "wedge", "bumps", "frame", "loose", "heavy", "two")
-PLAIN = ("plain", "frame")  # no form errors
+MASSES = {
+    "plain": [],
+    "frame": [],
+    "form": [3e-3],
+    "uneven": [3e-3],
+    "wedge": [3e-3],
+    "two": [5e-3, 5e-3],
+}
+"""Hidden masses [kg] of each kind of plate."""
 TAPER = {"uneven": 0.015, "wedge": 0.03}  # of the thickness, from the middle to the ends
-BUMPS, BUMP = (5, 4), 0.03  # of the thickness, standard deviation of each of so many fields
-FRAME, FRAME_STIFFER, FRAME_HEAVIER = 12e-3, 0.8, 0.35
-LOOSE = 0.35  # of its spring and damper
-HEAVY = {"heavy": [10e-3], "two": [5e-3, 5e-3]}
-INSIDE = np.array([(0.31, 0.37), (0.68, 0.59)]) * (LENGTH, WIDTH)
-"""Places of sensors that are not at ERAs."""
 NOISE, FLOOR = 0.01, 0.001
-PULP, PULP_DAMPING, CONTACT, PHALANX, JOINT, JOINT_DAMPING = 1000.0, 2.0, 2e-4, 5e-3, 500.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Hidden:
-    """A plate as it is: mounted, with the gains of sensors at its ERAs (n,) and of those INSIDE."""
+    """A plate as it is: mounted, with the gains of sensors at its ERAs (n,)."""
 
     mounted: Mounted
     sensor_gain: Complexes
-    inside_gain: Complexes
 
-    def measured(
-        self, frequencies: Reals, rng: np.random.Generator, sensors: int = len(CORNERS)
-    ) -> Complexes:
-        """Responses at ERAs, and INSIDE at more sensors than these (f, s, n) [1/s²], with noise."""
-        at = np.vstack([self.mounted.at, INSIDE])[:sensors]
-        clean = np.array([self.mounted.accelerations(f, at) for f in frequencies])
-        clean *= np.append(self.sensor_gain, self.inside_gain)[:sensors, None]
-        rms = np.sqrt((np.abs(clean) ** 2).mean(axis=(0, 2)))[:, None]
-        noise = rng.standard_normal((2, 2, *clean.shape))
-        parts = noise[:, 0] + 1j * noise[:, 1]
-        return np.asarray(clean + NOISE * np.abs(clean) * parts[0] + FLOOR * rms * parts[1])
+    def measured(self, frequencies: Reals, rng: np.random.Generator) -> Complexes:
+        """Responses at ERAs (f, n, n) [1/s²], with noise."""
+        mounted = self.mounted
+        exact = np.array([mounted.accelerations(f, mounted.at) for f in frequencies])
+        exact *= self.sensor_gain[:, None]
+        rms = np.sqrt((np.abs(exact) ** 2).mean(axis=(0, 2)))[:, None]
+        real, imaginary = rng.standard_normal((2, 2, *exact.shape))
+        relative_noise, floor_noise = real + 1j * imaginary
+        noise = NOISE * np.abs(exact) * relative_noise + FLOOR * rms * floor_noise
+        return np.asarray(exact + noise)
 
 
 def draw(kind: str, seed: int) -> Hidden:
-    """Draw a plate of a set.
+    """Draw a plate of a kind.
 
-    Plain, form (places and a hidden mass), hard (all else, too), or form with what the model has
-    not: uneven and wedge (tapered), bumps (of thickness), loose (one ERA) or with other masses:
-    heavy (10 g) and two (of 5 g); or frame (plain but for one bonded along the edges).
+    All but plain and frame have form errors: ERAs that are off inwards, and hidden masses. Uneven
+    and wedge are tapered as well; a frame is bonded along the edges.
     """
-    rng = np.random.default_rng([seed, SETS.index(kind)])
+    rng = np.random.default_rng([seed, [*MASSES].index(kind)])
     normal = rng.standard_normal
-    n, hard = len(CORNERS), kind == "hard"
-    thick = 1 + 0.02 * normal()
-    stiff = np.maximum(1 + 0.1 * normal(n), 0.3)
-    damped, lossy = 1.5 ** normal(), 1.5 ** normal()
-    each = np.exp(0.2 * normal(n))
-    gain = (1 + 0.05 * normal(n)) * np.exp(1j * np.radians(5) * normal(n))
-    sensor = (1 + 0.05 * normal(n)) * np.exp(1j * np.radians(5) * normal(n))
-    inwards = np.abs(1.5e-3 * normal((n, 2))) * (kind not in PLAIN)
-    mass = np.array([[*(rng.uniform(0.03, 0.97, 2) * (LENGTH, WIDTH)), 3e-3]])
-    sides = np.array([LENGTH, WIDTH]) + hard * 0.5e-3 * normal(2)
-    ratio, modulus = RATIO + hard * 0.015 * normal(), MODULUS * (1 + hard * 0.02 * normal())
-    bolt, exponent = hard * np.abs(0.5e-3 * normal(n)), hard * 0.3 * normal()
-    thickest = rng.uniform(0, 2 * np.pi)
-    taper = TAPER.get(kind, 0.0) * np.array([np.cos(thickest), np.sin(thickest)])
-    inside = (1 + 0.05 * normal(len(INSIDE))) * np.exp(1j * np.radians(5) * normal(len(INSIDE)))
-    if kind in HEAVY:
-        weights = HEAVY[kind]
-        at_random = rng.uniform(0.03, 0.97, (len(weights), 2)) * (LENGTH, WIDTH)
-        mass = np.column_stack([at_random, weights])
-    if kind == "loose":
-        loose = rng.integers(n)
-        stiff[loose] *= LOOSE
-        each[loose] *= LOOSE
-    plate = ThinPlate(
-        *(sides[0], sides[1], THICKNESS * thick, modulus, DENSITY, ratio),
-        parts=_parts(kind, (float(sides[0]), float(sides[1])), rng),
-        taper=(float(taper[0]), float(taper[1])),
-    )
-    corners = np.where(CORNERS > 0, sides, 0.0)
-    at = corners + np.where(CORNERS > 0, -inwards, inwards)
-    damping = 2 * DAMPING_RATIO * np.sqrt(STIFFNESS * LENGTH * WIDTH * THICKNESS * DENSITY / n)
+    count = len(CORNERS)
+
+    def gains() -> Complexes:
+        phases = np.radians(5) * normal(count)
+        return np.asarray((1 + 0.05 * normal(count)) * np.exp(1j * phases))
+
+    plate = ThinPlate(LENGTH, WIDTH, THICKNESS * (1 + 0.02 * normal()), MODULUS, DENSITY, RATIO)
+    angle = rng.uniform(0, 2 * np.pi)
+    taper = TAPER.get(kind, 0.0)
+    plate = replace(plate, taper=(taper * np.cos(angle), taper * np.sin(angle)))
+    if kind == "frame":
+        plate = replace(plate, frame=Frame())
+    inwards = np.abs(1.5e-3 * normal((count, 2)))
+    if kind in ("plain", "frame"):
+        inwards[:] = 0.0
+    weights = np.array(MASSES[kind])
+    at_random = rng.uniform(0.03, 0.97, (len(weights), 2)) * (LENGTH, WIDTH)
+    plate_mass = LENGTH * WIDTH * THICKNESS * DENSITY
+    damping = 2 * DAMPING_RATIO * np.sqrt(STIFFNESS * plate_mass / count)
     mounted = Mounted(
         plate,
-        at,
-        STIFFNESS * stiff,
-        damping * damped * each,
-        bolt,
-        gain,
-        mass if kind not in PLAIN else mass[:0],
-        LOSS * lossy,
-        exponent,
+        at=CORNERS + np.where(CORNERS > 0, -inwards, inwards),
+        stiffness=STIFFNESS * np.maximum(1 + 0.1 * normal(count), 0.3),
+        damping=damping * 1.5 ** normal() * np.exp(0.2 * normal(count)),
+        gain=gains(),
+        masses=np.column_stack([at_random, weights]),
+        loss=LOSS * 1.5 ** normal(),
     )
-    return Hidden(mounted, sensor, inside)
+    return Hidden(mounted, gains())
 
 
-def _parts(
-    kind: str, sides: tuple[float, float], rng: np.random.Generator
-) -> tuple[tuple[float, ...], ...]:
-    """Parts of a plate with a bonded frame, or of one with bumps."""
-    length, width = sides
-    if kind == "frame":
-        inner = (FRAME, length - FRAME, FRAME, width - FRAME)
-        return (
-            (0.0, length, 0.0, width, FRAME_STIFFER, FRAME_HEAVIER),
-            (*inner, -FRAME_STIFFER, -FRAME_HEAVIER),
-        )
-    if kind != "bumps":
-        return ()
-    x, y = (np.linspace(0, side, count + 1) for side, count in zip(sides, BUMPS, strict=True))
-    thicker = BUMP * rng.standard_normal(BUMPS)
-    return tuple(
-        (*x[i : i + 2].tolist(), *y[j : j + 2].tolist(), (1 + t) ** 3 - 1, t)
-        for (i, j), t in np.ndenumerate(thicker)
-    )
-
-
-def finger_stiffness(frequency: float, factors: Reals) -> complex:
-    """Force per displacement of a finger, a contact mass on a pulp before a phalanx on its joint.
-
-    factors (4,): on contact mass, pulp, phalanx, joint.
-    """
-    w, (mass, soft, bone, held) = 2 * np.pi * frequency, factors
-    pulp = soft * (PULP + 1j * w * PULP_DAMPING)
-    joint = held * (JOINT + 1j * w * JOINT_DAMPING)
-    moved = pulp / (pulp + joint - w**2 * PHALANX * bone)
-    return complex(-(w**2) * CONTACT * mass + pulp * (1 - moved))
-
-
-def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
-    """Errors in standard deviations by kind: springs and dampers over mass, gains, frequencies."""
-    space, x, plate = found.fitted.space, found.fitted.x, found.before.plate
-    mass = np.log(own.plate.thickness / plate.thickness)
-    model = found.fitted.model
-    elastic = np.sort(own.plate.modes[0])[3 : 3 + len(model.shifted_modes)]
-    solved = model.free
-    theory = solved.modes.eigenvalues[model.shifted_modes]
-    # Of the plate as written: that solved is of the thickness found.
-    theory = theory * (plate.thickness / solved.plate.thickness) ** 2
-    theory = theory * plate.material.E / solved.plate.material.E
-    gain = np.log(np.abs(own.gain))
-    phase = np.angle(own.gain)
-    true = {
-        "frequency": np.log(elastic / theory) / 2,
-        "stiffness": np.log(own.stiffness / [era.stiffness for era in found.before.eras]) - mass,
-        "damping": np.log(own.damping / [era.damping for era in found.before.eras]) - mass,
+def standard_errors_off(found: Identification, mounted: Mounted) -> dict[str, Reals]:
+    """Errors in standard deviations of springs over the plate's mass, and of gains."""
+    space, x, written = found.fitted.space, found.fitted.x, found.before
+    mass = np.log(mounted.plate.thickness / written.plate.thickness)
+    springs = np.array([era.stiffness for era in written.eras])
+    gain = np.log(np.abs(mounted.gain))
+    true_values = {
+        "stiffness": np.log(mounted.stiffness / springs) - mass,
         "gain": gain - gain.mean(),
-        "phase": phase - phase.mean(),
     }
-    errors, stds = {}, found.stds()
-    for kind, value in true.items():
+    deviations = found.stds()
+    errors = {}
+    for kind, true_value in true_values.items():
         estimate = relevant(space)[kind] @ (space.std * x)
-        errors[kind] = (estimate - value) / stds[kind]
-    places = space.groups["place"]
-    written = np.array([(era.x, era.y) for era in found.before.eras])
-    errors["place"] = (space.std[places] * x[places] - (own.at - written).ravel()) / stds["place"]
-    if len(own.masses) and len(found.values["masses"]):
-        x, y, weight = own.masses[0]
-        at = space.groups["masses"].start
-        off = found.values["masses"][0] - [weight, x, y]
-        std = np.hypot(found.std[at : at + 3], [0.0, *[PARAMETER_KINDS["place"].theory] * 2])
-        errors["mass"] = off / std
+        errors[kind] = (estimate - true_value) / deviations[kind]
     return errors
 
 
@@ -405,12 +344,10 @@ def measured_fault(fault: Fault, seed: int) -> Measurement:
     fingers = at[None] if fault.has_finger else None
     rows = []
     for frequency in FAULT_FREQUENCIES.tolist():
-        load = np.array([finger_stiffness(frequency, np.ones(4))])
-        rows.append(mounted.accelerations(frequency, positions, fingers=fingers, loads=load).T)
-    scales = 1 + _SENSOR_SCALE * rng.standard_normal(len(_SENSORS))
-    values = np.array(rows) * scales
+        rows.append(mounted.accelerations(frequency, positions, fingers=fingers).T)
+    values = np.array(rows) * (1 + _SENSOR_SCALE * rng.standard_normal(len(_SENSORS)))
     rms = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
-    white = rng.standard_normal((2, *values.shape))
-    values = values + NOISE * rms * (white[0] + 1j * white[1]) / np.sqrt(2)
+    real, imaginary = rng.standard_normal((2, *values.shape))
+    values = values + NOISE * rms * (real + 1j * imaginary) / np.sqrt(2)
     names = tuple(f"P{number}" for number in range(1, 1 + len(_SENSORS)))
     return Measurement(sensors_at(_SENSORS, names), FAULT_FREQUENCIES, values.swapaxes(1, 2))

@@ -37,14 +37,13 @@ class Situation:
     """What is so from one change of the fingers to the next [s] of the stream.
 
     fingers: places by id, in order of arrival; target: the id of the one to feel it, None where
-    no finger is there; from_rest: whether the plate was silent before.
+    no finger is there.
     """
 
     begin: float
     end: float
     fingers: Mapping[int, str]
     target: int | None
-    from_rest: bool
 
     @property
     def quiet(self) -> tuple[str, ...]:
@@ -69,11 +68,9 @@ class Stream:
     def situations(self) -> list[Situation]:
         """Each change with what it asks for: the finger that came last feels it."""
         situations = []
-        former_fingers: Mapping[int, str] = {}
         for (begin, fingers), (end, _) in pairwise(self.changes):
             target = max(fingers, default=None)  # ids are given in order of arrival
-            situations.append(Situation(begin, end, fingers, target, not former_fingers))
-            former_fingers = fingers
+            situations.append(Situation(begin, end, fingers, target))
         return situations
 
 
@@ -90,7 +87,6 @@ SENSORS: Mapping[str, Place] = {
     "P6": (0.26, 0.09),
 }
 STEADY = 0.3  # s; the end of each situation, when its transients have decayed
-ONSET = 0.1  # s; over which an onset is judged
 
 
 @dataclass(frozen=True)
@@ -106,9 +102,9 @@ class Heard:
     """A situation as it was on the plate, from start to end [s].
 
     patterns: as a daemon would report them; clocks: errors of the amplifiers' clocks, rms [s] by
-    name, as the last of them counts them, empty for one amplifier; steady, onset: what fingertips
-    felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]: at the sensors in the
-    end, at the frequencies that were played; fading: what sensors read where nobody touched.
+    name, as the last of them counts them, empty for one amplifier; steady: what fingertips felt in
+    the end, by place; phasors (f, s) [m/s²]: at the sensors in the end, at the frequencies of the
+    drive; fading: what sensors read where nobody touched.
     """
 
     situation: Situation
@@ -117,7 +113,6 @@ class Heard:
     patterns: tuple[Mapping[str, Any], ...] = ()
     clocks: Mapping[str, float] = field(default_factory=dict)
     steady: Mapping[str, FeltVibration] = field(default_factory=dict)
-    onset: Mapping[str, FeltVibration] = field(default_factory=dict)
     phasors: ComplexArray | None = None
     fading: Recording | None = None
 
@@ -198,24 +193,20 @@ class Streamed(Chain):
         heard = Heard(situation, begin, end)
         if situation.target is None:
             return replace(heard, fading=self._recorded(begin, end))
-        applied = [each for each in self.applied if begin <= each.time < end]
+        applied = [report for report in self.applied if begin <= report.time < end]
+        clocks: Mapping[str, float] = {}
+        for time, errors in self._counted:
+            if time < end:
+                clocks = errors
         steady = self._felt(end - STEADY, end)
-        heard = replace(
+        frequencies = np.array(next(iter(steady.values())).frequencies)
+        return replace(
             heard,
             patterns=tuple(map(_pattern, applied)),
-            clocks=next((each for time, each in reversed(self._counted) if time < end), {}),
+            clocks=clocks,
             steady=steady,
-            phasors=_phasors(
-                self._recorded(end - STEADY, end),
-                np.array(next(iter(steady.values())).frequencies),
-            ),
+            phasors=_phasors(self._recorded(end - STEADY, end), frequencies),
         )
-        if not situation.from_rest:
-            return heard
-        first = self._recorded(begin, begin + 2 * ONSET)
-        motion = np.abs(first.samples).max(axis=1)
-        onset = float(first.times[np.argmax(motion > 1e-3 * motion.max())])
-        return replace(heard, onset=self._felt(onset, onset + ONSET))
 
     def _felt(self, since: float, until: float) -> dict[str, FeltVibration]:
         """Vibration at each finger in a window [s], by place."""

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --editable
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test qemu-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants rename-test kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test qemu-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
 	bench-promise dist kernels smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -50,7 +50,7 @@ test-changed: .venv/installed-test
 
 # All that is long, one target after another, in at most three hours; the results are in
 # out/nightly/page.md. Others: make nightly NIGHTLY='soak kill-test', or NIGHTLY_OPTIONS=--report
-NIGHTLY := test-long test-kernels test-pymodbus test-busy faults mutants rename-test firmware-test qemu-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
+NIGHTLY := test-long test-kernels test-pymodbus test-busy faults mutants firmware-test qemu-test fuzz stop-test late-test kill-test soak qt-test estimate-test surface-test smoke-lowest weigh
 nightly: .venv/installed-test
 	$(BIN)/python tests/programs/nightly.py $(NIGHTLY) $(NIGHTLY_OPTIONS)
 
@@ -123,11 +123,6 @@ faults: .venv/installed-test
 MUTANTS := --count 10 --minutes 20
 mutants: .venv/installed-test
 	$(BIN)/python tests/faults/mutants.py $(MUTANTS)
-
-# Ten private functions renamed and a module reformatted: no planted fault and no test near them breaks.
-# Others: make rename-test RENAMES='--seed 3'
-rename-test: .venv/installed-test
-	$(BIN)/python tests/faults/renames.py $(RENAMES)
 
 # Two hundred daemons killed at random moments, over every wire, and when all was silent;
 # `make test` takes eight. Others: make kill-test KILLS='--kills 20 --seed 7'

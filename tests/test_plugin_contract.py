@@ -1,7 +1,6 @@
 """Plug-ins of every kind: found by name, and attributed to their package when they fail."""
 
 import asyncio
-import re
 import sys
 import tempfile
 import tomllib
@@ -18,13 +17,14 @@ from controller.content.formats import Ahap, content_format, content_formats, re
 from controller.content.reading import ContentFormat
 from controller.effects.effect import Effect
 from controller.effects.kinds import Buzz, effect_kind, effect_kinds
-from controller.effects.layout import SurfaceLayout
+from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.sources.touch import TOUCH_SOURCES, Contact, ContactKey, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.serial_line import SerialAddress
 from drivers.wires.wire import address_of
+from era_haptics.command import run_era
 from model.errors import InputError
 from model.structure.material import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import EXAMPLE_PREFIX, PluginRegistry, failure_text
@@ -175,6 +175,11 @@ of_every_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.gro
 made_of_urls = pytest.mark.parametrize(
     "kind", [kind for kind in KINDS if kind.ending], ids=lambda kind: kind.group
 )
+with_names_of_their_own = pytest.mark.parametrize(
+    "kind",
+    [kind for kind in KINDS if "'fine'" in kind.works],
+    ids=lambda kind: kind.group,
+)
 
 Install = Callable[..., str]
 """install(package, kind, name, source) -> the name of the plug-in's module."""
@@ -271,6 +276,18 @@ def test_plugin_that_fails_in_use_is_attributed_to_its_package(
     assert text.endswith("; repair or remove that package")
 
 
+def test_command_attributes_the_failure_of_a_plugin(
+    install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bad input (2), not a bug of this project (70)."""
+    kind = next(kind for kind in KINDS if kind.group == "wires")
+    module = install("bad", kind, "fine", kind.fails)
+    assert run_era(["amp", "stop", "fine://a:1"]) == 2
+    error = capsys.readouterr().err
+    assert f"plug-in {module}:THING of package bad" in error
+    assert "bug" not in error
+
+
 @of_every_kind
 def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Install) -> None:
     """Ours included; the error names the packages, and other names work."""
@@ -285,6 +302,14 @@ def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Instal
         assert set(named.split(", ")) == claimants
     install("four", kind, "other", kind.works.replace("'fine'", "'other'"))
     assert kind.look_up("other")
+
+
+def test_layout_names_the_packages_that_claim_a_kind(install: Install, tmp_path: Path) -> None:
+    """Of an effect whose name is its kind, which needs none beside it."""
+    install("one", KINDS[1], "buzz", KINDS[1].works)
+    (layout := tmp_path / "layout.yaml").write_text("effects: {buzz: {}}\n", "utf-8")
+    with pytest.raises(InputError, match=r"effects\.buzz: kind of effect buzz is claimed by"):
+        load_layout(layout, None)
 
 
 @of_every_kind
@@ -330,21 +355,12 @@ def test_every_touch_source_of_the_project_is_registered() -> None:
     )
 
 
-@of_every_kind
-def test_unknown_name_suggests_a_known_one(kind: Kind, install: Install) -> None:
-    """A package's name as well as one of ours; all known names are listed."""
-    install("good", kind, "pigeonry", kind.works)
-    with pytest.raises(kind.error) as caught:
-        kind.look_up("pigeonri")
-    unknown, _, known = str(caught.value).partition("? known: ")
-    ending = kind.ending
-    assert f"'pigeonri{ending}'" in unknown
-    assert unknown.endswith(f"did you mean pigeonry{ending}")
-    assert {f"pigeonry{ending}", f"{kind.own[0]}{ending}"} <= set(re.split("[,;] ", known))
-    group = f"era_haptics.{kind.group}"
-    assert known.endswith(f"entry point in {group}, which is found once its package is installed")
-    with pytest.raises(kind.error, match=f"'x{{40}}{ending}'; known: "):
-        kind.look_up("x" * 500)
+@with_names_of_their_own
+def test_plugin_has_the_name_of_its_entry_point(kind: Kind, install: Install) -> None:
+    """Otherwise a table would have another name than the rig."""
+    install("good", kind, "finer", kind.works)
+    with pytest.raises(kind.error, match=r"of package good .*'fine'"):
+        kind.look_up("finer")
 
 
 @made_of_urls

@@ -20,11 +20,9 @@ from packaging.tags import platform_tags
 
 from build_libraries import Library, tree_libraries, update
 from cases import shortly
-from licences import NOTES
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.compiled.versions import versions
 from packages import PACKAGES
-from smoke import requirements
 
 ROOT = Path(__file__).parents[1]
 LATER = 4_000_000_000  # s; a time of change after those of all files of the project
@@ -203,27 +201,6 @@ def test_library_is_compiled_if_its_sources_differ_from_those_it_was_compiled_of
     compiled = path.stat().st_ino
     update([library], tmp_path)
     assert path.stat().st_ino == compiled
-
-
-def test_licences_page_lists_every_dependency(wheel: Path) -> None:
-    """Each direct dependency of the wheel and its users' extras; copyleft by its name."""
-    page = (ROOT / "docs" / "reference" / "licences.md").read_text(encoding="utf-8")
-    items = re.findall(r"^- \*\*(.+?)\*\*: (.+(?:\n  .+)*)", page, re.MULTILINE)
-    listed = {
-        re.sub(r"[-_.]+", "-", requirement.split()[0]).lower(): licence
-        for licence, distributions in items
-        for requirement in distributions.split(",")
-    }
-    users = ("", "gateway", "cluster", "sound")
-    needed = {
-        re.sub(r"[-_.]+", "-", requirement.name).lower()
-        for requirement in requirements(wheel)
-        if requirement.marker is None
-        or any(requirement.marker.evaluate({"extra": extra}) for extra in users)
-    }
-    assert needed - listed.keys() == set()
-    assert {name for name, licence in listed.items() if licence == "not stated"} <= NOTES.keys()
-    assert listed["python-can"].startswith("LGPL")
 
 
 RIG = Path(__file__).parents[1] / "examples" / "paper_plate.yaml"

@@ -100,25 +100,6 @@ def row(time: float, *, contrast: float | None, quiet_fingers: int) -> TouchRow:
     )
 
 
-def test_felt_contrast_relates_levels_not_accelerations() -> None:
-    """Ten times threshold at 100 Hz against the same acceleration at 250 Hz: their thresholds'.
-
-    Both tones together are felt as the square root of the sum of squares.
-    """
-    low, high = detection_threshold(np.array([100.0, 250.0]))
-    target = vibration([[10 * low], [0.0]])
-    quiet = vibration([[0.0], [10 * low]])
-    mixed = vibration([[3 * low, 0.0], [4 * high, 0.0]])
-
-    contrast = steady_contrast_db(target, [quiet])
-    lower_contrast = steady_contrast_db(target, [mixed, quiet])
-
-    assert contrast == pytest.approx(20 * np.log10(high / low))
-    loudest = max(5, 10 * low / high)
-    assert lower_contrast == pytest.approx(20 - 20 * np.log10(loudest))
-    assert steady_contrast_db(target, []) is None
-
-
 def test_contents_are_told_apart_by_their_frequencies() -> None:
     """By hand: 10 times threshold of its own, 0.3 and 0.4 of others: 26 dB above their power."""
     thresholds = detection_threshold(np.array([90.0, 170.0, 260.0]))

@@ -27,7 +27,6 @@ from controller.daemon.children import gateway_options
 from controller.process.daemon_process import SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from model.errors import InputError
-from packages import PACKAGES
 from processes.gateways import wait_for
 from processes.interrupted import full_disk
 from registry.command_line import LoadModules, run
@@ -364,51 +363,6 @@ def test_main_ends_quietly_and_prints_what_its_output_cannot_encode(
         with run_typed(tmp_path, command, **printed) as done:
             assert done.communicate()[0] == output
             assert done.returncode == 0
-
-
-LOADED = """
-import contextlib, io, sys
-from importlib.metadata import packages_distributions
-from registry.command_line import join_commands
-from era_haptics.command import command_modules, run_era
-
-if "all" in sys.argv:
-    def help_of(command, path):
-        yield path
-        for name, part in getattr(command, "commands", {}).items():
-            yield from help_of(part, [*path, name])
-    paths = list(help_of(join_commands(command_modules())[0], []))
-else:
-    paths = [[]]
-with contextlib.redirect_stdout(io.StringIO()):
-    assert [run_era([*path, "--help"]) for path in paths] == [0] * len(paths)
-heavy = {"asyncio", "ssl", *packages_distributions()}
-print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.modules}))
-"""
-
-
-@pytest.mark.parametrize(
-    ("command", "own_modules"),
-    [
-        ("", set()),
-        # typer describes the options of a command with pydantic where that is installed.
-        pytest.param(
-            "all",
-            {"asyncio", "ssl", "pydantic", "pydantic_core", "annotated_types"},
-            marks=pytest.mark.long,
-        ),
-    ],
-)
-def test_help_loads_commands_and_typer_alone(command: str, own_modules: set[str]) -> None:
-    """So that it is quick."""
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED, command], capture_output=True, text=True, check=True
-    )
-    count, *loaded = done.stdout.split()
-    assert int(count) == 1 if not command else int(count) > 40
-    typers = {"typer", "annotated_doc", "shellingham", "typing_extensions", "typing_inspection"}
-    of_the_environment = {"_distutils_hack"}  # of setuptools
-    assert set(loaded) - set(PACKAGES) - typers - of_the_environment - own_modules == set()
 
 
 @pytest.mark.parametrize(

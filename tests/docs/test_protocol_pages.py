@@ -193,29 +193,6 @@ def test_levels_by_hand_are_those_of_the_playback(number: int, sets: list[LayerS
     assert levels == pytest.approx([float(cell) for cell in cells], abs=6e-5)
 
 
-def test_timeline_is_that_of_the_playback() -> None:
-    """A set that waits for an onset, the token of each moment, a renewal, the end and silence."""
-    for name in ("t [ms]", "commit", "voice", "valid_for", "token"):
-        assert f"\n    {name} " in PAGE
-    assert "0            30            60     70           120          160" in PAGE
-    assert "220   230" in PAGE
-    playback, onset = Playback(1, 8), Envelope(200, ((5000, 0), (8000, 0)))
-    playback.commit([LayerSet(0, 0, 200, (Command(0, 2200, 6000, 0, onset=onset),))], 1, 0.0)
-    playback.commit([LayerSet(0, 10, 100, (Command(0, 2200, 3000, 0),), after=True)], 2, 0.03)
-
-    def tokens_at(*moments: float) -> list[int]:
-        tokens = []
-        for moment in moments:
-            playback.advance(moment)
-            tokens.append(playback.tokens.get(0, 0))
-        return tokens
-
-    assert tokens_at(0.03, 0.0599, 0.0601, 0.119) == [1, 1, 2, 2]
-    playback.commit([LayerSet(0, 0, 100, renew=True)], 3, 0.12)
-    assert tokens_at(0.161, 0.2199, 0.2201) == [2, 2, 0]
-    assert playback.silent_from == pytest.approx(0.23)
-
-
 def test_angles_by_hand_are_those_of_the_voices() -> None:
     """n times clock modulo 2^32 is the angle of f times the clock's time, in whole turns."""
     for frequency, n, clock, product, angle in rows_of("| n | clock"):
@@ -380,18 +357,3 @@ def test_every_record_is_read_as_the_data_pack_it(name: str) -> None:
     for _ in range(20):
         values = drawn(fields, rng)
         assert record.unpack(packed(fields, values), is_strict=True) == values
-
-
-def test_each_read_of_the_status_object_is_a_new_status() -> None:
-    """It uses up a Mark, as can.md says: the next subindex has its own moment."""
-    amplifier = SimulatedAmplifier("a", channels=4)
-    objects = ObjectServer(amplifier, 1)
-    clock_subindex = words_of_page()["Status"].index(0x6000) + 1
-    amplifier.handle("Mark", {}, 1.0)
-    amplifier.withdraw_status()  # for all, without a reply
-
-    first_reading = objects.read(0x2002, clock_subindex, 3.0)
-    second_reading = objects.read(0x2002, clock_subindex, 3.0)
-
-    readings = [int.from_bytes(data, "little") for data in (first_reading, second_reading)]
-    assert [round(reading * 20 / 65536) for reading in readings] == [1, 3]

@@ -109,20 +109,6 @@ def test_layer_at_level_zero_is_silent_once_its_ending_is_over(valid_for: int, e
     assert playback.ends_by == pytest.approx(end)
 
 
-def test_playback_level_adds_tones_of_one_frequency_by_their_phases() -> None:
-    """Tones of 0.3, 0.4i and -0.3 at 99.95 Hz interfere, whenever they began; others do not."""
-    playback = Playback(1, 8)
-
-    playback.commit([layer(tone(99.95, 0.3), number=0)], 1, 0.0)
-    assert playback.level(0, 0.0) == pytest.approx(0.3)
-    playback.commit([layer(tone(99.95, 0.4, phase=90.0), number=1)], 2, 1.2345)
-    assert playback.level(0, 1.2345) == pytest.approx(0.5)
-    playback.commit([layer(tone(99.95, 0.3, phase=180.0), number=2)], 3, 7.7777)
-    assert playback.level(0, 7.7777) == pytest.approx(0.4)
-    playback.commit([layer(tone(100.0, 0.1), number=3)], 4, 8.0)
-    assert playback.level(0, 9.0) == pytest.approx(0.5)
-
-
 def test_playback_phase_of_a_command_is_a_lead_on_every_channel() -> None:
     """By hand: 0.5 at 90 degrees is 0.5i; 0.2 at -30 degrees is 0.1732 - 0.1i."""
     playback = Playback(2, 8)

@@ -79,6 +79,17 @@ def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
         assert int.from_bytes(objects.read(0x2002, _OLDER + 1, 0.0), "little") == WORD
 
 
+@pytest.mark.parametrize(
+    ("word", "volts"), [(0, None), (1, -12.0), (1201, 0.0), (1202, 0.01), (7201, 60.0)]
+)
+def test_reading_that_is_added_may_be_zero_or_less(word: int, volts: float | None) -> None:
+    """Steps count from the lowest value, which is 1; both ends agree."""
+    assert LATER.in_unit(Record(LATER).unpack([word], is_strict=True)) == volts
+    assert volts is None or LATER.quantity.to_wire(volts) == word
+    with pytest.raises(CommandError, match="-12 to 60 V"):
+        LATER.quantity.to_wire(-12.01)
+
+
 def test_added_numbers_may_be_missing_and_zero_is_not_stated() -> None:
     """Two readings are added, the first of two words; later words are ignored."""
     code = Number("code", QUANTITIES["code"])

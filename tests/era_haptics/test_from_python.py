@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from era_haptics.drive import playable_layers
+from kit.plates import make_paper_rig
 from model.answer.answer import Layer
 from model.cli import app
 from model.drive_modes import playable_drive_modes
@@ -43,6 +45,29 @@ def test_calibrate_finds_the_values_of_the_example() -> None:
     assert row["before"] == 17000.0
     assert row["after"] == stiffness
     assert row["unit"] == "N/m"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"eras": 2},
+        {"eras": 4.5},
+        {"eras": "six"},
+        {"layouts": "random:0"},
+        {"layouts": "nosuch.yaml"},
+        {"layouts": "random:3", "finalists": 0},
+        {"lowest": 0.5},
+        {"apart": "wide"},
+        {"where": "middle"},
+    ],
+    ids=str,
+)
+def test_design_refuses_an_argument_by_its_python_name(arguments: dict[str, object]) -> None:
+    """Not by the name of the command's option."""
+    with pytest.raises(era.InputError) as error:
+        era.design(make_paper_rig(12, 9), **arguments)  # type: ignore[arg-type]
+
+    assert "--" not in str(error.value)
 
 
 # Tables and queries
@@ -149,6 +174,14 @@ def test_plate_frames_have_a_row_for_each_mode_point_and_moment() -> None:
     assert [*playback.columns[1:]] == ["target_1_m_s2", "quiet_1_m_s2", "quiet_2_m_s2"]
 
 
+def test_frames_need_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without it, the error says how to install it."""
+    monkeypatch.setitem(sys.modules, "pandas", None)
+
+    with pytest.raises(era.InputError, match=r"to_frame needs pandas.*pip install pandas"):
+        PLATE.modes.to_frame()
+
+
 def test_draw_answer_shows_fingers_and_levels(table: era.LocalizationTable) -> None:
     """Circles of 13 mm at the fingers, the promise in the title, levels in decibels."""
     answer = era.query(table, TARGET, quiet=[QUIET, OTHER_QUIET])
@@ -197,6 +230,17 @@ def test_commands_for_follows_the_wiring() -> None:
         ("b", 2): (40.0, 0.0, 0.0),
         ("b", 5): (90, pytest.approx(0.5), pytest.approx(-57.296, abs=1e-3)),
     }
+
+
+def test_open_amplifier_simulates_a_rig_that_was_made_in_python() -> None:
+    """Its default amplifier `sim://` needs no file, and has a channel for each ERA."""
+    plate = era.Plate(length=0.3, width=0.2, thickness=0.0015, material="aluminium")
+    eras = {}
+    for name, position in {"SW": (0, 0), "SE": (0.3, 0), "NE": (0.3, 0.2)}.items():
+        eras[name] = era.Era(at=position, stiffness="17 kN/m")
+
+    with era.open_amplifier(era.rig(plate, eras)) as amplifier:
+        assert amplifier.capabilities["channels"] == 3
 
 
 def test_open_amplifier_applies_the_limits_of_the_rig() -> None:
@@ -271,3 +315,13 @@ def test_drive_is_refused_with_its_era_and_value(case: str) -> None:
     drive, message = REFUSED_DRIVES[case]
     with pytest.raises(era.InputError, match=message):
         playable_layers(drive, RIG)
+
+
+@pytest.mark.parametrize(
+    ("level", "phase_deg", "message"),
+    [(1.000000002, 0.0, "level.* got 1.000000002"), (1.0, math.inf, "phase.* got inf")],
+)
+def test_drive_refuses_a_level_or_phase(level: float, phase_deg: float, message: str) -> None:
+    """A level above 1, and a phase that is not finite."""
+    with pytest.raises(era.InputError, match=message):
+        era.Drive(110, level=level, phase_deg=phase_deg)

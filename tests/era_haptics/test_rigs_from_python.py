@@ -236,3 +236,11 @@ def test_playback_needs_the_target_of_a_drive(plate: era.SolvedPlate, answer: er
         plate.play(answer, quiet=[(0.15, 0.11)])
     with pytest.raises(era.InputError, match="target must be"):
         plate.play(answer, loads=[1])
+
+
+def test_answer_without_a_layer_has_no_map(plate: era.SolvedPlate, answer: era.Answer) -> None:
+    """Silence is not drawn."""
+    silent = replace(answer, contents=replace(answer.contents, streams=()))
+
+    with pytest.raises(era.InputError, match="must have a layer"):
+        plate.map(silent)

@@ -38,23 +38,6 @@ def test_map_equals_a_direct_solution() -> None:
     np.testing.assert_allclose(solved.peak, direct.peak, atol=1e-4 * direct.peak.max())
 
 
-def test_map_peak_is_the_sum_of_the_magnitudes_of_all_frequencies() -> None:
-    """A phase turns the field of its frequency; drives of one frequency add up."""
-    drive = {"SW": era.Drive(110, level=0.5), "NE": era.Drive(150, level=0.2)}
-
-    two_frequencies = PLATE.map(drive, raster=(7, 5))
-    turned = PLATE.map({"SW": era.Drive(110, level=0.5, phase_deg=90)}, raster=(7, 5))
-    drives = [era.Drive(110, level=0.2), era.Drive(110, level=0.3)]
-    added = PLATE.map({"SW": drives}, raster=(7, 5))
-
-    assert two_frequencies.frequencies.tolist() == [110, 150]
-    assert two_frequencies.field.shape == (2, 5, 7)
-    magnitudes = np.abs(two_frequencies.field)
-    np.testing.assert_allclose(magnitudes.sum(axis=0), two_frequencies.peak)
-    np.testing.assert_allclose(turned.field[0], 1j * two_frequencies.field[0], rtol=1e-9)
-    np.testing.assert_allclose(added.field[0], two_frequencies.field[0], rtol=1e-9)
-
-
 @pytest.mark.parametrize("seed", [None, 1])
 def test_responses_weighted_by_a_drive_are_its_map(seed: int | None) -> None:
     """Within 1e-6, for a plate with a mass, and for a drawn one."""

@@ -4,8 +4,6 @@ import asyncio
 import json
 import os
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -26,17 +24,6 @@ ROOT = Path(__file__).parents[2]
 
 BUTTON = ROOT / "examples" / "javascript" / "button.mjs"
 TARGET, QUIET = "0.08,0.06", "0.22,0.16"
-
-PAGE = "controller/gateway/page/connection.js"
-
-MEMBERS = """
-    const [name] = process.argv.slice(1);
-    const found = await import(name);
-    const of = (made) => Object.getOwnPropertyNames(made ?? {});
-    const members = Object.entries(found).map(([name, made]) =>
-        [name, [...of(made), ...of(made.prototype)]]);
-    console.log(JSON.stringify(Object.fromEntries(members)));
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -165,51 +152,3 @@ async def test_without_a_daemon_it_says_so(place: str, expected: int, message: s
     assert status == expected
     assert message in err
     assert len(err.splitlines()) == 1
-
-
-@pytest.mark.real_time
-def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
-    """By npm without a network, else as npm does; every declared function and method is there."""
-    node = installed_program("node", "nodejs", package="nodejs")
-    source = tmp_path / "examples" / "javascript"
-    user = tmp_path / "user"
-    shutil.copytree(BUTTON.parent, source)
-    (tmp_path / PAGE).parent.mkdir(parents=True)
-    shutil.copy(ROOT / PAGE, tmp_path / PAGE)
-    user.mkdir()
-    package = json.loads((source / "package.json").read_text("utf-8"))
-    installed = user / "node_modules" / "era-haptics"
-    npm = shutil.which("npm")
-    if npm is not None:
-        for command in (
-            "pack --silent",
-            f"install --offline --prefix {user} ./era-haptics-{package['version']}.tgz",
-        ):
-            subprocess.run([npm, *command.split()], cwd=source, check=True, capture_output=True)
-    else:
-        subprocess.run(package["scripts"]["prepack"], cwd=source, check=True, shell=True)
-        installed.mkdir(parents=True)
-        for pattern in (*package["files"], "package.json"):
-            for path in source.glob(pattern):
-                shutil.copy(path, installed)
-    api = (installed / "api.d.ts").read_text("utf-8")
-    for name, export in package["exports"].items():
-        done = subprocess.run(
-            [node, "--input-type=module", "-e", MEMBERS, f"era-haptics{name[1:]}"],
-            cwd=user,
-            check=True,
-            capture_output=True,
-            text=True,
-        )
-        has = json.loads(done.stdout)
-        types = (installed / export["types"]).read_text("utf-8")
-        declared = re.findall(r"^export (?:class|function) (\w+)", types, re.M)
-        assert set(declared) == has.keys()
-        classes = re.findall(r"^export class (\w+).*?\{\n(.*?)^\}", types, re.M | re.S)
-        for class_name, body in classes:
-            methods = set(re.findall(r"^  (?:static )?(\w+)[<(]", body, re.M))
-            assert methods - {"constructor", "on"} <= set(has[class_name])
-        exported = re.findall(r"^export (?:type|interface) (\w+)", api, re.M)
-        for used in re.findall(r"import type \{(.*?)\} from \"./api.js\"", types):
-            imported = re.findall(r"\w+", used)
-            assert set(imported) <= set(exported)

@@ -16,7 +16,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from controller.api.client import AsyncClient
 from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
 from kills import PLACES as KILLED_AT
@@ -24,7 +23,6 @@ from kills import kill_everywhere
 from kit.fingers import free_port, panel
 from processes import patient_daemon
 from processes.daemons import (
-    ERA,
     PATIENCE,
     REACTION,
     WATCHDOG,
@@ -39,31 +37,11 @@ from processes.daemons import (
     playing_daemon,
     plays_on,
     ready,
-    run_era,
     silent_from,
     until,
     until_state,
 )
 from sim.faults import FaultWindow
-
-
-@pytest.mark.real_time
-async def test_daemon_ends_while_a_large_rig_is_prepared(tmp_path: Path) -> None:
-    """Its amplifiers are open by then; clients are served meanwhile."""
-    hangs = (
-        "import runpy, threading\nfrom controller.play.planner import Planner\n"
-        "Planner.precompute = lambda planner, clock_errors: threading.Event().wait()\n"
-        f"runpy.run_path({patient_daemon.__file__!r}, run_name='__main__')"
-    )
-    async with far_end(tmp_path) as far:
-        journal, program = Journal(far), (sys.executable, "-c", hangs)
-        async with daemon_process(tmp_path, far, program=program, waits=False) as daemon:
-            await until(lambda: journal.entries and daemon.socket.is_socket())
-            async with await daemon.client() as era:
-                await asyncio.sleep(0.2)  # it is being prepared
-                assert (await era.status()).state == "NOT_READY"
-            daemon.process.terminate()
-            assert await daemon.status() == 0
 
 
 @pytest.mark.real_time
@@ -202,55 +180,6 @@ async def test_daemon_replays_nothing_when_starved(tmp_path: Path) -> None:
             assert not journal.raising_since(silent)
             if far.amplifier.fault == "WATCHDOG":
                 assert silent_from(far) - journal.last_fed("main") <= WATCHDOG + REACTION + 1e-9
-
-
-@pytest.mark.real_time
-async def test_daemon_plays_on_beside_a_second_one_and_without_descriptors(tmp_path: Path) -> None:
-    """A second one ends with status 2 and the process id of the first; at another socket it waits.
-
-    Without descriptors a connected client stops it; with them again, new clients connect.
-    """
-    async with playing_daemon(tmp_path) as (daemon, era, journal):
-        pid = daemon.process.pid
-        await disarmed(era)
-        async with era.armed("test", lease_s=60):  # renews its lease while daemons start
-            status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
-            assert status == 2
-            assert f"process {pid}" in err
-            text = (tmp_path / "daemon.yaml").read_text("utf-8")
-            (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
-            second_daemon = await asyncio.create_subprocess_exec(
-                *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
-            )
-            await until((tmp_path / "b.sock").is_socket)
-            async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
-                await until_state(waiting, "COMM_LOST")
-            second_daemon.terminate()
-            _, log = await second_daemon.communicate()
-            assert b"Traceback" not in log
-            assert (await era.status()).state == "OPERATION_ENABLED"
-        await play(era, daemon.far)
-        await until(lambda: any(daemon.far.summary().levels))
-        limits = limited(pid, resource.RLIMIT_NOFILE, max(numbers_in(f"/proc/{pid}/fd")) + 1)
-        waiting = []
-        try:
-            for _ in range(40):
-                waiting.append(socket.socket(socket.AF_UNIX))
-                waiting[-1].connect(str(daemon.socket))
-            os.kill(pid, signal.SIGHUP)
-            await plays_on("no descriptors left", daemon, era, journal)
-            await era.stop()
-            stopped = time.monotonic()
-            await until(lambda: loudness(daemon.far) == 0)
-            assert not journal.raising_since(stopped)
-            await ready(era)
-        finally:
-            resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
-            for connection in waiting:
-                connection.close()
-        await plays_on("descriptors again", daemon, era, journal)
-        async with await daemon.client() as second_daemon:
-            await second_daemon.stop()
 
 
 KILLS = 8  # `make kill-test` takes two hundred

@@ -5,9 +5,7 @@ protocol, so that a control loop that stands still shows as another state than O
 """
 
 import contextlib
-import socket
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,15 +18,12 @@ from processes.daemons import (
     PLACE,
 )
 from processes.gateways import (
-    TOKEN,
     GatewayProcess,
     RawWebSocket,
-    frame,
     gateway_process,
     has_ended,
     http,
     real_daemon,
-    upgrade,
     wait_for,
     wait_for_daemon,
     wait_for_state,
@@ -98,49 +93,6 @@ def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayPro
         silent = [held.enter_context(gateway.connect()) for _ in range(2000)]
         assert_served(gateway)
         wait_for(lambda: sum(not has_ended(connection) for connection in silent) <= 128)
-        assert_served(gateway)
-
-
-@pytest.mark.real_time
-def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: GatewayProcess) -> None:
-    """Single bytes do not extend a timeout; other clients are served meanwhile."""
-    head = f"POST /api/v1/arm HTTP/1.1\r\nHost: {gateway.host}\r\n"
-    full = f"{head}Authorization: Bearer {TOKEN}\r\nContent-Type: application/json\r\n"
-    page = f"GET /app.js HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
-    hello = frame(b'{"jsonrpc":"2.0","id":1,"method":"hello","params":{"client":"me"}}')
-    with contextlib.ExitStack() as held:
-        remaining: list[tuple[socket.socket, bytes]] = []
-        for begun in (
-            head,
-            f"{full}Content-Length: 100\r\n\r\n",
-            f"{full}Transfer-Encoding: chunked\r\n\r\n",
-            f"{head}Content-Length: 100\r\n\r\n",  # refused at once, without a token
-            f"{full}Content-Length: 2\r\n\r\n{{}}{head}",  # a second request
-        ):
-            slow = held.enter_context(gateway.connect())
-            slow.sendall(begun.encode())
-            remaining.append((slow, b"1"))
-        for number in range(20):
-            deaf = held.enter_context(socket.socket())
-            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-            deaf.connect(("127.0.0.1", gateway.port))
-            if number % 2:
-                deaf.sendall(upgrade(gateway))
-            remaining.append((deaf, 20 * (hello if number % 2 else page)))
-        assert_served(gateway)
-        end = time.monotonic() + PATIENCE
-        while remaining:
-            assert time.monotonic() < end, f"{len(remaining)} are still there"
-            for entry in list(remaining):
-                connection, data = entry
-                connection.setblocking(False)
-                try:
-                    connection.send(data)
-                except BlockingIOError:
-                    pass
-                except ConnectionError:
-                    remaining.remove(entry)
-            time.sleep(0.1)
         assert_served(gateway)
 
 

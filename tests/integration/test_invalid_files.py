@@ -3,7 +3,6 @@
 import os
 import pickle
 import random
-import time
 from pathlib import Path
 
 import pytest
@@ -16,10 +15,7 @@ from processes.daemons import (
     ENABLED,
     holding,
     ready_daemon,
-    write_daemon,
 )
-
-MAX_TIME = 5.0  # s; expanded aliases would take minutes, and gigabytes
 
 
 class Opened:
@@ -49,29 +45,6 @@ INVALID = [
     pytest.param(random.Random(5).randbytes(3000), "", id="noise"),
     pytest.param(None, "", id="endless device"),
 ]
-
-
-@pytest.mark.parametrize("role", ["daemon.yaml", "rig.yaml", "layout.yaml"])
-@pytest.mark.parametrize(("content", "place"), INVALID)
-def test_daemon_refuses_files_that_are_no_plain_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, role: str, content: bytes | None, place: str
-) -> None:
-    """As configuration, rig or layout: with the file's name, at once and without executing it."""
-    monkeypatch.chdir(tmp_path)
-    path = write_daemon(tmp_path, {"main": "sim://"}, "layouts: {panel: layout.yaml}\n")
-    (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
-    check_daemon(path)
-    (tmp_path / role).unlink()
-    if content is None:
-        (tmp_path / role).symlink_to("/dev/zero")
-    else:
-        (tmp_path / role).write_bytes(content)
-    begin = time.process_time()
-    with pytest.raises(InputError) as caught:
-        check_daemon(path)
-    assert time.process_time() - begin < MAX_TIME
-    assert f"{tmp_path / role}{place}" in str(caught.value)
-    assert not (tmp_path / "pickled").exists()
 
 
 @pytest.mark.parametrize("is_every_one", shortly([False, True], [False]))

@@ -6,12 +6,11 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from kit.plates import by_hand, contact_sets, forms_of, smooth_table
 from model import phased_weights, switched_patterns
 from model.answer.stimulus import Placement
-from model.arrays import NEARLY, Complex64Array, FloatArray, Point
+from model.arrays import Complex64Array, Point
 from model.drive_forms import Forms, WeightedTones
 from model.drive_modes import playable_drive_modes
 
@@ -126,48 +125,6 @@ def test_phased_weights_have_the_score_of_the_closed_form(seed: int) -> None:
         quotient = target @ np.linalg.solve(quiet, target.conj())
         quotients.append(quotient.real)
     assert score == pytest.approx(np.sqrt(max(quotients)), rel=1e-3)
-
-
-def test_weights_are_not_improved_by_nelder_mead() -> None:
-    """With two quiet fingers the three iterations are within 4 % (0.34 dB).
-
-    Relative to the best score of a general optimizer of real and imaginary parts.
-    """
-    (places,) = contact_sets(1, fingers=3, seed=4)
-    forms = forms_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))
-    rng = np.random.default_rng(0)
-    options = {"maxiter": 800, "xatol": 1e-4, "fatol": 1e-4}
-    scores = []
-    for row in range(3):
-
-        def loss(parts: FloatArray, row: int = row) -> float:
-            weights = parts[:4] + 1j * parts[4:]
-            score, _ = by_hand(forms, [(row, weights)])
-            return -score
-
-        start = rng.standard_normal(8)
-        optimum = minimize(loss, start, method="Nelder-Mead", options=options)
-        scores.append(-optimum.fun)
-
-    assert best_score("phased", forms) >= 0.96 * max(scores)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_best_drives_come_first(mode: str) -> None:
-    """Scores are those of the drives by hand, and descend; all drives reach the level."""
-    for places in contact_sets(4, fingers=3, seed=11):
-        forms = forms_on_plate(places)
-
-        drives = scored_drives(mode, forms)
-
-        assert len(drives) >= 4
-        previous = np.inf
-        for score, drive in drives:
-            assert score <= previous * (1 + NEARLY)
-            previous = score
-            expected, level = by_hand(forms, drive)
-            assert score == pytest.approx(expected, rel=1e-3)
-            assert level >= forms.wanted * (1 - 1e-5)
 
 
 @pytest.mark.parametrize("mode", MODES)

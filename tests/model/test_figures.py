@@ -2,17 +2,19 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from paper_figures import PaperFigure, paper_figures
-from tables import stiffness_study, tables
+from tables import tables
 
 from era_haptics.command import run_era
 from kit.plates import make_paper_rig, small_table, write_rig
 from model.arrays import FloatArray
+from model.figures.answers import answer_figure
 from model.figures.table_pictures import levels_figure
 from model.rig.rig import Rig
 
@@ -149,29 +151,6 @@ def test_patterns_of_figure_12_leave_few_nulls(figures: dict[str, PaperFigure]) 
     np.testing.assert_allclose(peak, rotated, rtol=1e-5, atol=1e-5 * peak.max())
 
 
-def test_doubled_stiffness_scales_the_map_of_figure_13(
-    figures: dict[str, PaperFigure], paper_rig: Rig
-) -> None:
-    """Section 3.3, 250 Hz, 8 to 16 kN/m: 1.5 to 1.8 times the maximum, correlation above 0.98.
-
-    The study has the maxima of the two maps at these; at 17 kN/m its correlation is highest.
-    """
-    soft, stiff = peaks_of(figures["figure_13_maps"]).values()
-    assert 1.5 < stiff.max() / soft.max() < 1.8
-    assert np.corrcoef(soft, stiff)[0, 1] > 0.98
-
-    study = stiffness_study(paper_rig)
-
-    stiffness, maximum = study["stiffness / kN/m"], study["maximum / g"]
-    for value, peak in ((8.0, soft), (16.0, stiff)):
-        row = np.abs(stiffness - value).argmin()
-        assert stiffness[row] == pytest.approx(value)
-        assert maximum[row] == pytest.approx(peak.max() / 9.8)
-    correlation = study["correlation"]
-    assert stiffness[correlation.argmax()] == pytest.approx(17, rel=0.1)
-    assert correlation.max() <= 1 + 1e-12
-
-
 # Pictures of tables
 
 
@@ -186,3 +165,13 @@ def test_figure_of_levels_has_each_cell() -> None:
     np.testing.assert_array_equal(levels, table.available_level_db_sl.reshape(3, 4))
     (crosses,) = [line for line in axes.lines if line.get_marker() == "x"]
     assert len(crosses.get_xdata()) == 0
+
+
+def test_figure_of_no_answer_has_only_words() -> None:
+    """For ERAs that move a nanometer."""
+    table = small_table()
+    eras = tuple(replace(era, stroke=1e-9) for era in table.eras)
+
+    figure = answer_figure(replace(table, eras=eras))
+
+    assert figure.axes == []

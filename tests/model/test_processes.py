@@ -17,7 +17,7 @@ import pytest
 import model.compiled
 from build_libraries import Library, compile_library, kernel_library
 from model import caching, processes
-from model.arrays import NEARLY, best_along, best_first, best_of
+from model.arrays import NEARLY, best_along, best_of
 from model.caching import NUMERICS_VERSION, code_version
 from model.compiled import kernels as compiled_kernels
 from model.compiled.kernels import kernels, processor_features, why_slow
@@ -216,20 +216,6 @@ def test_first_of_nearly_equal_best_scores_is_chosen(scores: list[float]) -> Non
     expect_always(best_of, scores, 1)
     expect_always(lambda rounded: best_along(rounded[None], axis=1), scores, [1])
     expect_always(lambda rounded: best_along(rounded[::-1, None], axis=0), scores, [0])
-
-
-@pytest.mark.parametrize(
-    ("scores", "order"),
-    [
-        ([2.0, 7.0, 2.0, 0.0, 7.0], [1, 4, 0, 2, 3]),
-        ([1.0, np.inf, -np.inf, np.inf], [1, 3, 0, 2]),
-        ([], []),
-    ],
-    ids=["finite", "infinite", "none"],
-)
-def test_nearly_equal_scores_keep_their_order(scores: list[float], order: list[int]) -> None:
-    """The best come first."""
-    expect_always(best_first, scores, order)
 
 
 # Kernels

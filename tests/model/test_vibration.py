@@ -264,6 +264,12 @@ def test_pressing_fingertips_are_more_sensitive() -> None:
     assert max(pacinian) <= 35
 
 
+def test_unknown_set_of_thresholds_is_refused() -> None:
+    """By the names of the known sets."""
+    with pytest.raises(InputError, match=PRESSING):
+        detection_threshold(np.array([100.0]), "thumb")
+
+
 def test_sensation_level_adds_tones_as_powers() -> None:
     """Two tones at the threshold are together 3 dB above it; without motion it is -inf."""
     frequencies = np.array([100.0, 250.0])

@@ -31,7 +31,7 @@ from sim.plant.era_motions import motion_of
 from sim.plant.finger_placement import FingerPlacement
 from sim.plant.imperfections import Imperfections
 from tests.sim.armed_bench import SESSION as BENCH_SESSION
-from tests.sim.armed_bench import arm_bench, keep_alive
+from tests.sim.armed_bench import keep_alive
 from tests.sim.armed_bench import play as play_at_once
 
 AT = (0.08, 0.06)
@@ -88,29 +88,6 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
     # From 4.75 s to 5.05 s as before, and to 15.25 s so.
     expected = 0.3 * 40e-6 - 10.2 * 30e-6
     assert steered / (2 * math.pi * 110) == pytest.approx(expected, abs=1e-6)
-
-
-START = 98765.4321  # as large as a clock may be
-
-
-def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
-    """Two seconds later, the plate has been decaying since the watchdog expired."""
-    prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
-    for bench in (prompt, late):
-        bench.place_fingers({"a": (0.1, 0.1)}, now=START)
-        arm_bench(bench, 0.25, now=START)
-        play_at_once(bench, AmplifierTone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02)
-    for step in range(1, 401):
-        prompt.advance(START + 0.1 + step * 0.005)
-    for bench in (prompt, late):
-        bench.advance(START + 2.1)
-        assert bench.amplifiers["main"].fault == "WATCHDOG"
-    window = START + 0.3, START + 0.5
-    np.testing.assert_allclose(
-        late.felt(*window)["a"].peak, prompt.felt(*window)["a"].peak, rtol=1e-4
-    )
-    driven = late.felt(START + 0.25, START + 0.35)["a"].peak.max()
-    assert late.felt(START + 1.9, START + 2.1)["a"].peak.max() < 0.02 * driven
 
 
 A, B = (0.1, 0.07), (0.29, 0.2)

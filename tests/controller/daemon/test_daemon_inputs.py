@@ -210,43 +210,6 @@ async def test_failed_input_is_restarted_after_growing_pauses(
 
 
 @in_virtual_time
-async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) -> None:
-    """One is the target, two are quiet; each lies where its source's calibration puts it.
-
-    The plate is 0.3048 m by 0.2286 m, TUIO counts downwards, and one panel is upside down.
-    """
-    first_port, second_port = free_port(), free_port()
-    further_lines = (
-        "touch:\n"
-        f'  - {{name: left, url: "tuio:127.0.0.1:{first_port}"}}\n'
-        f'  - {{name: right, url: "tuio:127.0.0.1:{second_port}", calibration: {{turned: 180}}}}\n'
-    )
-    async with ready_daemon(tmp_path, further_lines) as (_, era):
-        await era.arm("me", lease_s=60)
-        roles = list[str]()
-        finger = TouchFrame("panel", 0.0, (Touch(7, 0.25, 0.25),))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            for number in range(1, 2000):
-                for port in (first_port, second_port):
-                    sender.sendto(tuio_datagram(finger, number), ("127.0.0.1", port))
-                await era.touch([(0.15, 0.1)])
-                await asyncio.sleep(0.02)
-                contacts = (await era.status()).contacts
-                roles = sorted(contact.role or "" for contact in contacts)
-                if roles == ["quiet", "quiet", "target"]:
-                    break
-        positions = dict[tuple[str, int], tuple[float, float]]()
-        for contact in contacts:
-            source = contact.source.partition(":")[0]
-            positions[source, contact.id] = (contact.x_m, contact.y_m)
-        assert positions == {
-            ("left", 7): pytest.approx((0.0762, 0.17145)),
-            ("right", 7): pytest.approx((0.2286, 0.05715)),
-            ("api", 1): pytest.approx((0.15, 0.1)),
-        }
-
-
-@in_virtual_time
 async def test_daemon_names_inputs_that_are_missing_or_mute(tmp_path: Path) -> None:
     """First in the status, in an event and in the metrics, with what came instead, until it plays.
 

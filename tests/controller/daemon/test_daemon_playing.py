@@ -14,8 +14,6 @@ import pytest
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import StatusResult, TouchParams
-from controller.api.server import Connection
-from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.definition import QUANTITIES
 from kit.clock import in_virtual_time
 from kit.fingers import answers_take
@@ -504,41 +502,6 @@ async def test_daemon_ignores_jumps_of_the_wall_clock(monkeypatch: pytest.Monkey
 
         await daemon.reach(READY)
         assert threads.now() - start == pytest.approx(3.0, abs=0.1)
-
-
-@in_virtual_time
-async def test_plate_plays_on_when_the_name_of_a_client_cannot_be_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The control loop reads strengths that the API has set, and calls no code of the API."""
-
-    def fail(client: Connection) -> str:
-        raise AssertionError("name of a client read in the control loop")
-
-    async with served_daemon(has_seats=True) as daemon:
-        plate = daemon.bench.daemon.config.rig.plate
-
-        async def hold(*places: str) -> None:
-            """Hold fingers of a touch source of the daemon for 0.4 s."""
-            touches = list[Touch]()
-            for number, place in enumerate(places):
-                x, y = PLACES[place]
-                touches.append(Touch(number, x / plate.length, 1 - y / plate.width))
-            for _ in range(20):
-                frame = TouchFrame("panel", threads.now(), tuple(touches))
-                daemon.bench.daemon.controller.cycle.deliver(frame)
-                await asyncio.sleep(0.02)
-
-        await daemon.era.arm("test", lease_s=60)
-        await hold("left")
-        await daemon.era.strength("left", -6)
-        await hold("left")
-        assert levels_of(await daemon.era.status()) == pytest.approx([14.0], abs=0.2)
-
-        with monkeypatch.context() as broken:
-            broken.setattr(Connection, "name", property(fail), raising=False)
-            await hold("left", "right")
-        assert levels_of(await daemon.era.status()) == pytest.approx([14.0, 20.0], abs=0.2)
 
 
 FADE = 0.100

@@ -273,26 +273,6 @@ def test_http_touches_belong_to_their_connection(
     wait_for(lambda: not first.is_open)
 
 
-def test_http_connections_leave_places_of_the_daemon_to_others(
-    gateway: GatewayProcess, daemon: ScriptedDaemon
-) -> None:
-    """A ninth is refused until one of them closes."""
-    headers = {"Authorization": f"Bearer {TOKEN}"}
-    with contextlib.ExitStack() as stack:
-        first, *middle_clients, ninth = [
-            stack.enter_context(httpx.Client(base_url=gateway.url, headers=headers))
-            for _ in range(9)
-        ]
-        for client in (first, *middle_clients, first):
-            assert client.post("api/v1/status").status_code == 200
-        assert len({id(client) for client in daemon.callers}) == 8
-        assert ninth.post("api/v1/status").status_code == 429
-        with RawWebSocket(gateway):
-            pass
-        first.close()
-        wait_for(lambda: ninth.post("api/v1/status").status_code == 200)
-
-
 def test_http_body_may_have_line_feeds_wait_or_be_missing(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
@@ -434,25 +414,6 @@ def test_websocket_receives_current_state_and_events(
         event = LogEvent(level="error", message=text, cause=text, remedy=text)
         daemon.publish("log", event)
         assert next_event(ws, "log") == event.model_dump()
-
-
-def test_websocket_is_a_client_of_its_own(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """The daemon knows when it has left, and completes what it was sent before."""
-    with RawWebSocket(gateway) as first, RawWebSocket(gateway) as second:
-        for ws in (first, second):
-            ws.call("touch", PARAMETERS["touch"])
-            assert ws.response()["result"] == {}
-        leaving, staying = daemon.callers
-        with daemon.holding():
-            first.call("arm", PARAMETERS["arm"])
-            wait_for(lambda: "arm" in daemon.methods)
-            first.call("stop", {})
-            first.connection.close()
-            wait_for(lambda: leaving.has_left and "stop" in daemon.methods)
-        wait_for(lambda: not leaving.is_open)
-        assert staying.is_open
-        second.call("effects", {}, id=2)
-        assert second.response(2)["result"]
 
 
 def test_websocket_receives_the_field_of_the_drive(

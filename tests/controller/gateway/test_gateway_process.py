@@ -106,22 +106,6 @@ def test_gateway_serves_outside_the_loopback_by_its_key(
         assert gateway.terminate() == 0
 
 
-def test_gateway_prints_an_ipv6_url_with_a_random_token(
-    daemon: ScriptedDaemon, tmp_path: Path
-) -> None:
-    """Of the loopback, in brackets; other hosts are refused, and tokens of other gateways."""
-    another_token = GatewaySettings(socket=tmp_path).token
-    with gateway_process(tmp_path, daemon.socket, "--listen", "[::1]:0", token=None) as gateway:
-        assert gateway.url.startswith("http://[::1]:")
-        token = [gateway.token]
-        wait_for(lambda: http(gateway, token=token).status == 200)
-        assert http(gateway, token=token, more=[f"Origin: http://{gateway.host}"]).status == 200
-        assert http(gateway, token=token, host=["evil.example"]).status == 421
-        assert http(gateway, token=[another_token]).status == 401
-        assert len({gateway.token, another_token, GatewaySettings(socket=tmp_path).token}) == 3
-        assert len(gateway.token) == len(another_token) == 43  # 256 bits
-
-
 def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
     """With the port, the reason and the option; a demonstration with its own, at once."""
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -4,7 +4,6 @@ The level of the first channel is looked at every millisecond. It must follow th
 full level of 0.2, within a step of the wire and the 2 ms by which sets can come sooner or later.
 """
 
-import asyncio
 import math
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
@@ -245,23 +244,6 @@ async def test_amplifier_without_knots_follows_a_course_along_ramps() -> None:
         loop.must_follow(looks, early=0.05, late=0.06)
         assert max(level for _, level in looks) > 0.16
         assert len(loop.vibrations) == pytest.approx(24, abs=2)
-
-
-@in_virtual_time
-async def test_all_actuators_have_one_course_times_their_weights() -> None:
-    """On two amplifiers: one channel has half the level of the other at every moment."""
-    async with set_running("main", "side", knots=32, intent_source=FeelsCourse(WAVE)) as chain:
-        chain.table.excitation = {"SW": Tone(110.0, 20e-6), "NE": Tone(110.0, 10e-6, 1.0)}
-        levels = []
-        for number in range(1300):
-            if number % 10 == 0:
-                chain.put(FINGER)
-            playing = chain.levels()
-            levels.append((playing["main"][0], playing["side"][1]))
-            await asyncio.sleep(0.001)
-    main, side = np.array(levels).T
-    assert main.max() == pytest.approx(FULL_LEVEL, abs=ROUNDING)
-    np.testing.assert_allclose(side, main / 2, atol=ROUNDING)
 
 
 def envelope_of(

@@ -120,17 +120,6 @@ def test_contact_is_reported_once_down_once_moved_and_once_up(tracker: TouchedTr
     assert tracker.contacts == ()
 
 
-def test_contacts_are_in_order_of_arrival(tracker: TouchedTracker) -> None:
-    """The order within frames does not matter; a finger that returns is the newest."""
-    tracker.touch(0.0, Touch(5, 0.1, 0.1))
-    tracker.touch(0.0, FINGER, source="b")
-    tracker.touch(0.1, Touch(9, 0.2, 0.1), Touch(5, 0.2, 0.2))
-    assert keys(tracker.contacts) == [("a", 5), ("b", 1), ("a", 9)]
-    tracker.touch(0.2, Touch(9, 0.2, 0.1))
-    tracker.touch(0.3, Touch(9, 0.2, 0.1), Touch(5, 0.2, 0.2))
-    assert keys(tracker.contacts) == [("b", 1), ("a", 9), ("a", 5)]
-
-
 @pytest.mark.parametrize(
     ("x", "y", "reason"),
     [
@@ -204,19 +193,6 @@ def test_many_names_do_not_keep_a_panel_out(
     tracker.touch(0.0, *fingers(19), source="tuio:other")
     assert shares(tracker)["panel"] == 10
     assert shares(tracker).get("tuio:other", 0) == share
-
-
-def test_source_without_frames_for_150_ms_has_its_contacts_lifted(tracker: TouchedTracker) -> None:
-    """Other sources keep theirs."""
-    tracker.touch(10.0, *fingers(2, first=1))
-    tracker.touch(10.1, FINGER, source="b")
-    assert tracker.next_expiry == pytest.approx(10.15)
-    assert tracker.expire(10.149).up == ()
-    assert keys(tracker.expire(10.151).up) == [("a", 1), ("a", 2)]
-    tracker.touch(10.2, FINGER, source="b")
-    assert tracker.expire(10.3).up == ()
-    assert keys(tracker.expire(10.36).up) == [("b", 1)]
-    assert tracker.next_expiry == math.inf
 
 
 @pytest.mark.parametrize(

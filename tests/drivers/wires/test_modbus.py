@@ -13,12 +13,10 @@ import pytest
 from pymodbus.logging import Log
 
 from cases import in_turn, shortly
-from drivers.protocol.definition import MESSAGES, STATUS
 from drivers.protocol.records import Values
 from drivers.wires import modbus_frames
 from drivers.wires.modbus import ModbusWire, SilentPort
 from drivers.wires.modbus_frames import (
-    HEAD,
     Adu,
     AduReader,
     Read,
@@ -226,28 +224,6 @@ def exchange(wire: ModbusWire, far_end: FarEnd, name: str, values: Values) -> ob
     read = write(wire, far_end, name, values)
     (arrival,) = wire.received(far_end.reply(read))
     return arrival
-
-
-def test_request_reads_as_many_registers_as_its_reply_can_have() -> None:
-    """At first for 16 channels and 16 layers, then for the 4 channels and 8 layers of this one."""
-    wire = ModbusWire(0, is_rtu=True, number=0)
-    far_end = FarEnd(is_rtu=True)
-    status = HEAD + STATUS.words + sum(record.words for record in STATUS.added)
-    capabilities = HEAD + MESSAGES["GetCaps"].reply.words + 3 * 16
-    achieved = HEAD + MESSAGES["GetAchieved"].reply.words
-    limits = {
-        "GetStatus": status + 16 + 16,
-        "GetAchieved": achieved + 4 * 16,
-        "GetCaps": capabilities,
-        "GetFaults": 122,
-    }
-    identified = {**limits, "GetStatus": status + 4 + 8, "GetAchieved": achieved + 4 * 4}
-
-    for counts in (limits, identified):
-        for name, count in counts.items():
-            read = write(wire, far_end, name, {"layer": 0} if name == "GetAchieved" else {})
-            assert read[4:6] == count.to_bytes(2), name
-        assert isinstance(exchange(wire, far_end, "GetCaps", {}), Reply)
 
 
 @rtu_and_tcp

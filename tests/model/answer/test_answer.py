@@ -12,7 +12,7 @@ from kit.set_table import drives, only, phased, wants
 from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
 from model.answer.plan import answer, prepare_answers
 from model.answer.promise import felt_amplitudes, loudest_power
-from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger import detection_threshold
@@ -280,21 +280,6 @@ def test_twenty_fingers_take_little_memory(without_kernels: Callable[[], None]) 
 # Fingers that share or are held back
 
 
-def test_nearest_two_of_the_fingers_that_may_share_do() -> None:
-    """Others keep their own contents."""
-    places = ((0.09, 0.07), (0.14, 0.08), (0.25, 0.18), (0.05, 0.19))
-    first, second, third = (wants(place, may_share=True) for place in places[:3])
-    fingers = [first, replace(second, priority=1), third, wants(places[3])]
-
-    served = phased(smooth_table(), fingers, min_contrast_db=3.7)
-
-    assert served.fingers[0].verdict == "shared"
-    assert "shares" in served.applied[0]
-    excitations = drives(served)
-    assert excitations[0] == excitations[1]
-    assert excitations[2] != excitations[1]
-
-
 def test_only_contents_of_one_name_are_shared() -> None:
     """Of two pairs of names the nearer pair shares, though the third finger is between them."""
     places = ((0.09, 0.07), (0.14, 0.08), (0.11, 0.12), (0.25, 0.18))
@@ -355,19 +340,6 @@ def test_lowest_priority_is_held_back() -> None:
     assert held_back.promised_contrast_db == separate.fingers[3].promised_contrast_db
     assert held_back.foreign_level_db_sl < 20
     assert [sensation.layer for sensation in others] == [0, 1, 2]
-
-
-def test_remaining_content_keeps_its_band() -> None:
-    """The band of the content that is held back is not its own."""
-    high = wants(NEAR, (470, 500))
-    low = wants(FAR, (40, 320), priority=-1)
-    fingers = [replace(high, sharing=NEVER), replace(low, sharing=NEVER)]
-
-    served = phased(smooth_table(), fingers, min_contrast_db=99)
-
-    assert served.fingers[1].verdict == "held back"
-    for name, tone in drives(served)[0].items():
-        assert 470 <= tone.frequency <= 500, name
 
 
 # Side bands

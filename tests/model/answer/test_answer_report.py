@@ -1,7 +1,9 @@
 """Measures of answers, their exposure, and questions in JSON."""
 
+import errno
 import re
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,11 +20,12 @@ from model.answer.answer_report import (
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement
 from model.arrays import lattice
+from model.commands.table_cli import query as query_command
 from model.finger import detection_threshold, fingertip_points
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
-from model.table.table_file import build_table
+from model.table.table_file import build_table, save_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.plate_in_time import plate_in_time
 from model.transients.shaping import Transients
@@ -192,3 +195,16 @@ def test_batch_reads_a_line_key_by_key():
     assert row_layer["fingers"] == [0, 1]
     contrast = row["fingers"][0]["promised_contrast_db"]
     assert contrast == sensation.promised_contrast_db
+
+
+def test_batch_reports_a_closed_pipe_and_no_broken_file(tmp_path, monkeypatch):
+    """As in `era table query TABLE --batch FILE | head`."""
+    batch = tmp_path / "b.jsonl"
+    batch.write_text('{"target": [0.1, 0.1]}\n')
+    file = tmp_path / "t.npz"
+    save_table(smooth_table(), file)
+    broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    monkeypatch.setattr("builtins.print", broken)
+
+    with pytest.raises(BrokenPipeError):
+        query_command(file, batch=batch)

@@ -34,7 +34,7 @@ from model.answer.answer import (
     Sensation,
 )
 from model.answer.plan import answer
-from model.answer.stimulus import BY_NAME, MUST, NEVER, Finger, Stimulus
+from model.answer.stimulus import BY_NAME, MUST, Finger, Stimulus
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.finger import THRESHOLDS, detection_threshold
@@ -322,29 +322,6 @@ def test_hand_with_three_contents_silences_no_other_person(order: tuple[int, ...
         assert [sensation.verdict for sensation in hand[1:]] == ["shared", "shared"]
         assert len({sensation.layer for sensation in hand}) == 1
         assert served.promised_worst_db == pytest.approx(single.promised_worst_db, abs=1.0)
-
-
-def test_hand_that_may_not_share_gives_way() -> None:
-    """Its contents, which no plan serves, are held back for the other person's.
-
-    If two fingers of a hand feel nothing, the third's content is held back. Alone, the hand gets
-    the best vibration.
-    """
-    for places in hands():
-        separate = phased(example_table(), fingers_at(places, "abcd", NEVER))
-        first, *_, far = fingers_at(places, "abcd", BY_NAME)
-        quiet = [Finger(place) for place in places[1:3]]
-        with_quiet = phased(example_table(), [first, far], quiet)
-
-        verdicts = [sensation.verdict for sensation in separate.fingers[:3]]
-        assert verdicts == ["held back"] * 3, places
-        assert is_served(separate.fingers[3])
-        assert with_quiet.fingers[0].verdict == "held back"
-        assert is_served(with_quiet.fingers[1])
-
-    *hand, _ = fingers_at(hands()[-1], "abcd", NEVER)
-    alone = phased(example_table(), hand)
-    assert MIXED in {sensation.verdict for sensation in alone.fingers}
 
 
 def test_fingers_9_cm_apart_do_not_share() -> None:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,13 @@ import pytest
 from cases import read_yaml, shortly
 from kit.plates import SMALL_TABLE_HZ, contact_sets, smooth_rig, smooth_table
 from kit.set_table import only, phased, wants
-from model.answer import plan, tone_search
+from model.answer import plan
+from model.answer.envelope import Course
 from model.answer.plan import query
 from model.answer.promise import share_stroke
 from model.answer.question import Contents, Stream
 from model.answer.stimulus import Finger, Placement, Stimulus, check_fingers, together
-from model.answer.tone_search import choose_by_numpy, choose_tones, worst_ratios
+from model.answer.tone_search import choose_by_numpy, choose_tones
 from model.arrays import Point
 from model.ensemble.draws import ClockErrors
 from model.errors import InputError
@@ -138,64 +138,6 @@ def test_kernel_agrees_with_numpy(name: str, seed: int) -> None:
 
 # The search
 
-POSITIONS = np.random.default_rng(5).uniform([0.02, 0.02], [0.29, 0.21], (8, 2))
-PLACES = [(float(x), float(y)) for x, y in POSITIONS]
-
-
-@cache
-def table_with_mass() -> LocalizationTable:
-    """Return the table of four ERAs and a mass."""
-    return build_table(replace(smooth_rig(), masses=(MASS,)))
-
-
-def test_search_of_the_best_frequencies_loses_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Relative to a search of all frequencies: 0.1 dB on average, at a level that is as high."""
-    table = table_with_mass()
-    exhaustive = replace(table)  # without the rules that the table keeps
-    with monkeypatch.context() as patch:
-        patch.setattr(tone_search, "KEPT", len(table.frequencies))
-        only(exhaustive, Placement((PLACES[0],), (PLACES[1],)))
-    stream = Stream((0,), 20.0, ((0, len(table.frequencies)),))
-    losses = []
-
-    for target, quiet_count in product(range(4), (1, 2, 4)):
-        others = PLACES[:target] + PLACES[target + 1 :]
-        places = (PLACES[target], *others[: target + quiet_count])
-        contents = Contents(places, (), (stream,), tuple(range(1, len(places))))
-        tones = choose_tones(table, contents)
-        best = choose_tones(exhaustive, contents)
-        losses.append(best.worst_db - tones.worst_db)
-        assert tones.level_db_sl[0][1] > best.level_db_sl[0][1] - 0.1, places
-
-    assert np.mean(losses) < 0.1
-
-
-def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:
-    """By hand: two contents, a quiet finger and an unprotected finger, on eleven plates.
-
-    The percentile of eleven plates is the second smallest; a content alone counts at the quiet
-    finger only. By a second set of thresholds the power of the second content is four times as
-    high, which lowers the first finger's ratio to a quarter.
-    """
-    own = np.array([[2.0] * 11, [3.0] * 11])
-    loudest = np.ones((2, 4, 11))
-    loudest[1, 0] = np.arange(1, 12)  # the second content at the first one's finger
-    loudest[:, 3] = 1e6
-    streams = [Stream((0,), 20.0, ()), Stream((1,), 20.0, ())]
-    pair = np.array([[0, 1]])
-    rig_thresholds = np.ones((1, 2), dtype=np.float32)
-    thresholds = np.array([[1, 1], [1, 2]], dtype=np.float32)
-
-    of_pair = worst_ratios(pair, streams, [2], own, loudest, rig_thresholds)
-    of_single = worst_ratios(pair.T, streams, [2], own, loudest, rig_thresholds)
-    by_two_sets = worst_ratios(pair, streams, [2], own, loudest, thresholds)
-    by_reversed_sets = worst_ratios(pair, streams, [2], own, loudest, thresholds[::-1])
-
-    assert of_pair == pytest.approx([4 / 10])
-    assert of_single == pytest.approx([4.0, 9.0])
-    assert by_two_sets == pytest.approx([4 / 40])
-    assert by_reversed_sets == pytest.approx([4 / 40])
-
 
 def test_higher_priority_has_its_stroke_first() -> None:
     """By hand: two others have one factor, half of what remains and a little less."""
@@ -267,6 +209,13 @@ def test_stimulus_is_rejected(name: str) -> None:
 
     with pytest.raises(InputError, match=argument.removesuffix("_db_sl")):
         Stimulus(**arguments)
+
+
+@pytest.mark.parametrize("duration", ["0.5", 0.2])
+def test_stimulus_with_a_course_has_no_other_duration(duration: object) -> None:
+    """The course has one."""
+    with pytest.raises(InputError, match="duration"):
+        Stimulus(duration=duration, course=Course((0, 0.5), (1, 1)))
 
 
 @pytest.mark.parametrize("name", REJECTED["fingers"])
@@ -375,6 +324,23 @@ def test_limit_is_as_strong_as_a_quiet_finger_allows(mode: str) -> None:
     for answer in (quiet, alone):
         lowered = 26.0 - answer.fingers[0].promised_level_db_sl
         assert answer.fingers[0].lowered_db == pytest.approx(lowered, abs=1e-3)
+
+
+def test_limit_is_not_lowered_for_another_content() -> None:
+    """The other vibration does not count; without quiet fingers both have their levels."""
+    neighbor = Finger((0.05, 0.17), Stimulus(20.0))
+
+    answer = phased(smooth_table(), [LIMIT, neighbor])
+
+    verdicts = {sensation.verdict for sensation in answer.fingers}
+    assert verdicts <= {"own", "mixed"}
+    assert answer.fingers[0].promised_level_db_sl >= 12.0 - 1e-3
+
+    alone = phased(smooth_table(), [LIMIT], [NEAR_TARGET, neighbor.at])
+    joint = phased(smooth_table(), [LIMIT, neighbor], [NEAR_TARGET], min_contrast_db=-99.0)
+    assert joint.fingers[2].foreign_level_db_sl > -10.0
+    level_alone = alone.fingers[0].promised_level_db_sl
+    assert joint.fingers[0].promised_level_db_sl > level_alone - 3.0
 
 
 def test_two_targets_share_a_vibration_of_their_level() -> None:

@@ -70,6 +70,15 @@ def show_lines(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return era("table", "show", path, "--weak").stdout.splitlines()
 
 
+def test_show_prints_a_summary(show_lines: list[str]) -> None:
+    """Dead zones, feasible cells, contrast, mesh and fingerprint."""
+    rows = {line[:20].strip(): line[20:].strip() for line in show_lines}
+
+    assert rows["dead zones"].startswith("0 %")
+    for name in ("feasible cells", "contrast to 3 others", "mesh", "fingerprint"):
+        assert rows[name], name
+
+
 def test_show_prints_a_map(show_lines: list[str]) -> None:
     """The map is 4 by 3, with errors of its values, and each of its stars is in the list."""
     (start,) = [

@@ -28,7 +28,6 @@ from model.config.units import (
     LENGTH,
     TEMPERATURE,
     Dimension,
-    in_meters,
     quantity,
     unit_scale,
 )
@@ -140,29 +139,6 @@ def test_validation_returns_valid_parts_of_an_invalid_file(tmp_path: Path) -> No
 
 
 # Quantities
-
-
-@pytest.mark.parametrize(
-    ("place", "remedy"),
-    [
-        ((8.0, 6.0), "0.08,0.06"),
-        ((20.0, 0.0), "0.2,0"),
-        ((80.0, 60.0), "0.08,0.06"),
-        ((0.4, 0.1), ""),
-        ((1.0, 0.1), ""),
-        ((-8.0, 6.0), ""),
-        ((800.0, 6.0), ""),
-        ((math.nan, 6.0), ""),
-        ((math.inf, 6.0), ""),
-    ],
-)
-def test_position_that_smaller_units_put_on_the_plate_is_converted(
-    place: tuple[float, float], remedy: str
-) -> None:
-    """The plate is 0.3 m by 0.2 m; no finger is half a centimeter from a corner."""
-    *_, converted = in_meters(*place, length=0.3, width=0.2).rpartition(" ")
-
-    assert converted == remedy
 
 
 @pytest.mark.parametrize("name", VALUES["si"])
@@ -362,6 +338,19 @@ def test_missing_file_is_refused(tmp_path: Path, name: str) -> None:
 
     (problem,) = error.value.problems
     assert problem.line is None
+
+
+def test_document_with_too_many_values_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than the limit, lowered here from 50 000."""
+    monkeypatch.setattr("model.config.document.MAX_DOCUMENT_VALUES", 100)
+
+    with pytest.raises(ConfigError) as error:
+        read(tmp_path, "a: [" + "1," * 200 + "1]")
+
+    (problem,) = error.value.problems
+    assert problem.line == 1
 
 
 @for_all(st.binary(max_size=200) | st.text(alphabet="ab:-[]{}#&*!|>'\"%@ \n\t1.,?", max_size=80))

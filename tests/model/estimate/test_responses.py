@@ -438,3 +438,13 @@ def test_responses_per_volt_are_read_for_exciters_alone(responses, coarse_rig, t
     np.testing.assert_allclose(values, responses.values, rtol=1e-11)
     with pytest.raises(InputError, match=f"measured.{ending}.*per displacement of the base"):
         measurement_of(rows, coarse_rig)
+
+
+@only_csv
+def test_sensor_of_two_masses_is_rejected(responses, coarse_rig, path):
+    """A sensor has one mass in all rows."""
+    write_responses_csv(path, with_masses(responses, (2e-3,) * 3), coarse_rig)
+    damage(path, ",2.0\n", ",3.0\n")
+
+    with pytest.raises(InputError, match="must have one mass, got"):
+        measurement_of(read_measured(path), coarse_rig)

@@ -16,7 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from cases import shortly
-from kit.direct_plate import direct_acceleration, direct_responder
+from kit.direct_plate import direct_responder
 from kit.plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -276,42 +276,6 @@ def test_threads_share_the_shapes_at_points():
 
 
 # The reduced plate
-
-COARSE = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)
-INSIDE = ((0.17, 0.07), (0.95, 0.35), (0.39, 1.0))
-
-
-@pytest.mark.parametrize(
-    "shares", [CORNERS, (*INSIDE, INSIDE[0])], ids=["corners", "two at one place"]
-)
-def test_reduced_plate_response_equals_direct_solve(shares):
-    """Its equations, solved frequency by frequency, are within 3e-5 of the direct solve.
-
-    Two ERAs at one place need the same static vectors: one set of them is dropped.
-    """
-    eras = [
-        replace(era, stiffness=17000.0 * (number + 1), bolt_mass=0.004 * number)
-        for number, era in enumerate(eras_at(PAPER, *shares))
-    ]
-    frequencies = np.array([31.7, 68.1, 110.0, 250.0, 444.0, 500.0])
-    stiffnesses = np.array([era.stiffness for era in eras])
-    bolt_masses = np.array([era.bolt_mass for era in eras])
-
-    reduced = reduce_plate(PAPER, COARSE, footprints_of(eras))
-
-    at_eras, at_nodes = reduced.at(footprints_of(eras)), reduced.at(COARSE.nodes)
-    response = []
-    for omega in 2 * np.pi * frequencies:
-        springs = stiffnesses + 1j * omega * 3.5
-        on_springs = springs - omega**2 * bolt_masses
-        attached = (at_eras.T * on_springs) @ at_eras
-        free_stiffness = (1 + 0.01j) * reduced.omega**2 - omega**2
-        dynamic = np.diag(free_stiffness) + attached
-        forces = at_eras.T * springs * 1e-4
-        deflections = at_nodes @ np.linalg.solve(dynamic, forces)
-        response.append(-(omega**2) * deflections.T)
-    expected = direct_acceleration(assemble(PAPER, COARSE), eras, frequencies, COARSE.nodes)
-    assert_within(np.array(response), expected, 3e-5)
 
 
 def test_slopes_are_those_of_waves() -> None:

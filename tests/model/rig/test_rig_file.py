@@ -520,6 +520,18 @@ def test_check_lists_eras_whose_gain_is_not_measured() -> None:
     assert gain_notes(exciter_rig()) == []
 
 
+def test_check_warns_of_gains_that_are_measured_too_far_apart() -> None:
+    """Halfway between rows 90 degrees apart a straight line has 0.7 of the gain.
+
+    179 and -176 degrees are 5 apart. Rows beyond the frequency limits are not played.
+    """
+    rows = "gains: [[40, 2, 179], [150, 2, -176], [255, 2, 94], [300, 2, 90], [320, 2, 0]]"
+
+    _, note = gain_notes(four_era_rig((GAINS, rows)))
+
+    assert note.startswith("eras.SE.gains: phases differ by 90 degrees between 150 and 255 Hz")
+
+
 def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(coarse_rig: Rig) -> None:
     """Gains lie on the line between two complex rows and multiply their own ERA's response."""
     low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)

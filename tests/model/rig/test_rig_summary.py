@@ -23,6 +23,7 @@ from kit.plates import exciter_rig, exciter_rig_text
 from model.arrays import ComplexArray
 from model.commands.plate_show_cli import show
 from model.config.document import ConfigError, data_text, parse_document
+from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.plate_sections import PLAIN_KEYS, PlateSection
 from model.rig.rig import Rig, Uncertainty
@@ -301,6 +302,12 @@ def test_check_warns_of_what_can_harm_an_exciter(keys: str, key: str, message: s
 
     about_key = [note for note in notes if note.startswith(f"eras.SW.{key}")]
     assert message in "\n".join(about_key), notes
+
+
+def test_current_that_cannot_follow_is_rejected() -> None:
+    """5 mH with a force factor of 10 T m."""
+    with pytest.raises(InputError, match="inductance of exciter SW must let"):
+        exciter_rig("type: DAEX25CT-4, force_factor: 10, inductance: 5 mH")
 
 
 @pytest.mark.parametrize(

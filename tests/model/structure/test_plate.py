@@ -18,12 +18,9 @@ from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate
-from model.reduction.supported_plate import supported_modes
 from model.rig.rig import Rig
 from model.rig.rig_writing import rig as rig_by_keys
-from model.spectral.plate_mesh import SpectralMesh
-from model.structure.attachments import PointLoad, footprints_of
+from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 from model.structure.fingertips import Fingertip, FingertipLoad
 from model.structure.footprints import mean_over
@@ -170,6 +167,16 @@ def test_value_out_of_range_is_rejected(valid, key, number):
     """The error names the key and the number."""
     with pytest.raises(InputError, match=rf"{key} .*got {number}"):
         replace(valid, **{key: number})
+
+
+def test_laminate_without_meaning_is_rejected():
+    """Bounds and waves of a laminate are those of isotropic layers that share their losses."""
+    with pytest.raises(InputError, match=r"^laminate: .*layer"):
+        Laminate(())
+    with pytest.raises(InputError, match=r"^laminate: .*bond none"):
+        Laminate((replace(LAYER, loss_factor=0.1),) * 2, Bond.NONE)
+    with pytest.raises(InputError, match="isotropic"):
+        Laminate((LaminateLayer(WOOD, 1e-3),) * 2)
 
 
 def test_material_without_elastic_energy_is_rejected():
@@ -377,25 +384,6 @@ def test_plate_on_too_few_springs_is_rejected(eras: list[Era]) -> None:
         check_supported(SHEET, eras)
 
 
-@pytest.mark.parametrize(
-    ("phalanx_mass", "stiffness", "damping"),
-    [(0.005, [69, -87, -358], 0.1), (1e9, [972, 921, 507], 1.999)],
-    ids=["phalanx that moves", "phalanx at rest"],
-)
-def test_dynamic_stiffness_of_a_fingertip(
-    phalanx_mass: float, stiffness: list[float], damping: float
-) -> None:
-    """At 60, 100 and 250 Hz: real parts from the formula by hand, and a lower bound of losses."""
-    frequencies = np.array([60.0, 100.0, 250.0])
-    omega = 2 * np.pi * frequencies
-    fingertip = Fingertip(phalanx_mass=phalanx_mass)
-
-    dynamic_stiffness = fingertip.dynamic_stiffness(omega)
-
-    assert dynamic_stiffness.real == pytest.approx(stiffness, abs=1)
-    np.testing.assert_array_less(damping * omega, dynamic_stiffness.imag)
-
-
 def test_annular_wave_averages_to_the_bessel_function():
     """The mean of cos(k x) over a disc is 2 J1(k a) / (k a): 0.88010117 at k a = 1."""
     radius = 0.01
@@ -508,27 +496,3 @@ def test_feet_hold_the_weight_of_board_and_frame() -> None:
     assert support_problem(rig.plate, rig.eras, loads=rig.masses) is None
     problem = support_problem(one_foot_rig.plate, one_foot_rig.eras, loads=one_foot_rig.masses)
     assert problem is not None
-
-
-def test_foam_loses_the_same_share_of_energy_in_frequency_and_in_time() -> None:
-    """A rigid board on foam of loss factor eta heaves with a damping ratio of eta / 2 in time.
-
-    In frequency it has the dynamic stiffness 4 k (1 + i eta) - omega² m.
-    """
-    rigid_material = Material("rigid", E=1e14, rho=2000.0, nu=0.3)
-    plate = Plate(0.3, 0.2, 0.005, rigid_material, loss_factor=0.0)
-    corners = [(0.0, 0.0), (0.0, 0.2), (0.3, 0.0), (0.3, 0.2)]
-    foam = [PointLoad(x, y, stiffness=2e3, loss_factor=0.15) for x, y in corners]
-    middle, frequencies = np.array([[0.15, 0.1]]), np.array([10.0, 20.0, 40.0])
-    free = solve_free_plate(plate, SpectralMesh(6, 6, 0.3, 0.2), frequency_max=100.0)
-
-    reduced = reduce_free_plate(free, footprints_of(foam))
-    modes = supported_modes(reduced, [], loads=foam, frequency_max=100.0)
-    receptances, _ = free.receptances(middle, middle, frequencies, loads=foam)
-
-    assert modes.damping_ratios == pytest.approx([0.075] * 3, rel=2e-3)
-    heave = math.sqrt(8e3 / 0.6) / (2 * math.pi)
-    assert modes.natural_frequencies[0] == pytest.approx(heave, rel=2e-3)
-    omega = 2 * np.pi * frequencies
-    expected = 1 / (8e3 * (1 + 0.15j) - omega**2 * 0.6)
-    np.testing.assert_allclose(receptances[:, 0, 0], expected, rtol=2e-3)

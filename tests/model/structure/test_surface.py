@@ -233,6 +233,17 @@ def test_modes_of_impossible_damping_are_rejected(
     assert load_rig(stated).plate.loss_factor == 0.02
 
 
+def test_modes_below_zero_are_rejected(modes: Modes, tmp_path: Path) -> None:
+    """Only frequencies of rigid-body modes can be negative, by rounding."""
+    frequencies = modes["frequencies"].copy()
+    frequencies[0] = -0.5
+    load_rig(write_rig(tmp_path, modes, frequencies=frequencies))
+
+    frequencies[5] *= -1
+    with pytest.raises(InputError, match=r"modes\.npz: frequencies of modes must be 0 Hz or above"):
+        load_rig(write_rig(tmp_path, modes, frequencies=frequencies))
+
+
 # Mass, fields and tables
 
 
@@ -399,6 +410,14 @@ def test_cut_out_has_no_fingers(cut_out: Path) -> None:
     assert change.rejected == ("off_plate",)
     with pytest.raises(InputError, match=r"finger must be within the outline"):
         check_on_plate("finger", [(0.152, 0.1)], rig.plate)
+
+
+def test_surface_seen_along_its_plane_is_rejected(cut_out: Path) -> None:
+    """Along a wrong normal the surface is a line."""
+    text = f"surface: {{modes: modes.npz, normal: x}}{ERAS}"
+
+    with pytest.raises(InputError, match=r"nodes must extend along both axes across x, got a line"):
+        parse_rig(str(cut_out), text)
 
 
 def test_nothing_is_computed_in_a_cut_out(cut_out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,6 @@ from model.errors import InputError
 from model.finger import Grid
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.plate import AirGap, Laminate, LaminateLayer
-from model.study.overview import find_overview, summarize
 from model.study.promise_cost import PromiseCost, clock_cost, tolerance_costs
 from model.study.table_export import export_csv, export_mat
 from model.study.weak_cells import (
@@ -229,6 +228,18 @@ def test_export_csv_has_answers_in_the_drive_mode_of_the_table(
         assert float(row["promised_level_db_sl"]) >= 20 - 1e-3
 
 
+def test_export_csv_has_fields(table: LocalizationTable, tmp_path: Path) -> None:
+    """A row for each raster point and frequency, both parts of each ERA's field, to the bit."""
+    rows = csv_rows(table, tmp_path, "fields")
+
+    assert len(rows) == table.raster.point_count * 3
+    row = rows[3 * 7 + 2]
+    assert (float(row["x_m"]), float(row["y_m"])) == tuple(table.raster.points[7])
+    assert row["frequency_hz"] == "250.0"
+    field = complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"]))
+    assert np.complex64(field) == table.unit_fields(table.raster.points)[2, 2, 7]
+
+
 # Contrast maps
 
 QUIET = (0.2286, 0.0381)  # m; center of the fourth cell of the lowest row
@@ -264,6 +275,18 @@ def test_map_has_the_answer_of_every_place(
         assert promised == pytest.approx(sensation.promised_contrast_db, abs=1e-3), place
         nominal = contrasts.nominal_db[mode][row, column]
         assert nominal == pytest.approx(sensation.contrast_db, abs=1e-3), place
+
+
+def test_map_is_a_frame(contrasts: era.ContrastMap) -> None:
+    """Places along x come first, with a column for each mode and figure."""
+    frame = contrasts.to_frame()
+
+    assert frame.shape == (15, 6)
+    promised = contrasts.promised_db["phased"]
+    best = frame.loc[frame["phased_promised_db"].idxmax()]
+    row, column = np.unravel_index(np.nanargmax(promised), promised.shape)
+    assert best["x_m"] == contrasts.x[column]
+    assert best["y_m"] == contrasts.y[row]
 
 
 def test_command_prints_the_map(
@@ -352,23 +375,3 @@ def test_weak_and_feasible_follow_from_12_db() -> None:
     assert weak.feasible.tolist() == [True, True, False, False]
     assert weak.weak.tolist() == [False, True, True, True]
     assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
-
-
-def test_summary_of_a_plate_too_small_for_two_fingers() -> None:
-    """If no two fingers fit 5 cm apart the distribution is empty, not an endless loop."""
-    rig = make_paper_rig(6, 6)
-    eras = []
-    for corner in rig.eras:
-        eras.append(replace(corner, x=0.03 * (corner.x > 0), y=0.03 * (corner.y > 0)))
-    small = replace(
-        rig,
-        plate=replace(rig.plate, length=0.03, width=0.03),
-        mesh=replace(rig.mesh, length=0.03, width=0.03),
-        eras=tuple(eras),
-    )
-    table = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
-
-    summary = summarize(table, find_overview(table))
-
-    assert summary["promised_contrast_1_quiet_median_db"] is None
-    assert summary["feasible_share"] is None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import kstest, truncnorm
 
 from kit.direct_plate import direct_acceleration
 from kit.outside_files import EXAMPLES
@@ -293,6 +294,15 @@ def plates_on_feet(uncertainty: Uncertainty, count: int) -> Plates:
     """Return plates drawn from an uncertainty, for two contacts."""
     rng = np.random.default_rng(0)
     return draw_plates(rng, uncertainty, of=ON_FEET, count=count, contact_count=2)
+
+
+def test_springs_of_drawn_plates_are_positive() -> None:
+    """At the largest uncertainty they have the distribution of a normal number cut off at 0."""
+    stiffness = plates_on_feet(replace(Uncertainty(), stiffness=0.5), 1000).stiffness
+
+    assert stiffness.min() > 0
+    expected = truncnorm(-2, np.inf, loc=1, scale=0.5)
+    assert kstest(stiffness.ravel(), expected.cdf).pvalue > 0.01
 
 
 def test_drawn_plates_have_the_spreads_of_the_uncertainty() -> None:

@@ -193,6 +193,12 @@ def test_raster_fits_thin_and_small_plates(thickness: float) -> None:
     np.testing.assert_allclose(height, [[0.029]], rtol=1e-5)
 
 
+def test_raster_needs_six_points_on_each_side() -> None:
+    """Five points carry no quintic."""
+    with pytest.raises(InputError, match="6 to"):
+        Raster(5, 9, 0.1, 0.1)
+
+
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
 
 

@@ -94,6 +94,32 @@ def test_load_table_refuses_a_flipped_bit(path: Path, place: str) -> None:
         load_table(path)
 
 
+def forged_arrays() -> dict[str, tuple[str, Arrays]]:
+    """Return the part that an error names, and arrays that replace those of a table."""
+    table = small_table()
+    return {
+        "pickle": ("readable", {"frequencies": np.array([{"a": 1}], dtype=object)}),
+        "type": ("readable", {"shapes": table.shapes.astype(np.float64)}),
+        "not a number": ("checksum", {"shapes": table.shapes * np.float32(np.nan)}),
+        "fewer": ("checksum", {"omega": table.omega[:10]}),
+        "another member": ("readable", {"extra": np.zeros(3)}),
+        "empty header": ("header", {"header": np.frombuffer(b"{}", dtype=np.uint8)}),
+        "binary header": ("header", {"header": np.frombuffer(b"\xff\0", dtype=np.uint8)}),
+    }
+
+
+def test_load_table_refuses_forged_arrays(path: Path) -> None:
+    """Pickles, other types, missing or additional members."""
+    with np.load(path, allow_pickle=False) as content:
+        arrays = dict(content)
+
+    for name, (part, forged) in forged_arrays().items():
+        np.savez(path, **arrays | forged)
+        with pytest.raises(InputError) as error:
+            load_table(path)
+        assert part in str(error.value), name
+
+
 REPLACED = {
     "fingerprint": {"fingerprint": "0" * 64},
     "raster": {"raster": {"length": 0.4}},

@@ -61,20 +61,6 @@ def test_shift_moves_the_high_word_on() -> None:
     assert clock.reading(0.0) == 0x0001_0000
 
 
-@pytest.mark.parametrize("rate", [0, 500, -32768])
-def test_moment_of_a_high_word(rate: int) -> None:
-    """The clock has a high word from its moment on, and the one before just until then."""
-    clock = AmplifierClock(Crystal(error=-50e-6, warm_up=1e-6, ahead=3.3), since=1e5)
-    clock.steer(rate, 1e5 + 2)
-    now = 1e5 + 2.5
-    high = ((clock.reading(now) >> 16) + 1638) % 65536
-    moment = clock.reaches(high, now)
-    assert clock.reading(moment) >> 16 == high
-    assert clock.reading(moment - 10e-9) >> 16 == high - 1
-    # 1637 to 1638 steps of 20 s / 65536, by a clock that is at most 3.4 per mille fast or slow.
-    assert 1637 * 20 / 65536 * 0.996 < moment - now < 1638 * 20 / 65536 * 1.004
-
-
 SESSION = 7
 
 

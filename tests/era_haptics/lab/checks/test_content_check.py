@@ -158,6 +158,17 @@ def test_command_reports_levels_over_time_and_draws_a_picture(
     assert picture.stat().st_size > 0
 
 
+def test_command_fails_below_the_required_share(table_file: str) -> None:
+    """Exit status 1."""
+    quiet = ("--quiet", "0.21,0.06")
+
+    result = run_check("success", "--table", table_file, *AT_PLACE, *quiet, "--least", "1")
+
+    assert result.exit_code == 1
+    assert "lost too much; at least 100 % of the level must be kept" in result.stdout
+    assert "dB above quiet fingers" in result.stdout
+
+
 FRACTIONS = ((0.5, 0.5), (0.2, 0.3), (0.35, 0.75), (0.65, 0.2), (0.8, 0.6))
 """The positions that are tried by default, relative to the plate's sides."""
 

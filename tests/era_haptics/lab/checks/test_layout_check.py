@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cases import in_turn, shortly
+from cases import in_turn
 from controller.cli.config_cli import config_kinds
 from controller.content.pattern import Pattern
 from controller.effects.effect import Effect, Region
@@ -80,33 +80,6 @@ def button(frequency: float | None = None) -> Region:
 # Effects of a region
 
 
-@pytest.mark.parametrize("is_resting", shortly([False, True], [True]))
-@pytest.mark.parametrize("effect", [Click(duration=0.02), Click(), Buzz(level=15.0)])
-def test_check_reports_the_level_that_the_plate_makes_felt(
-    effect: Effect, is_resting: bool
-) -> None:
-    """The same touch through controller, wire and amplifier, within a decibel of its simulation."""
-    touches = checked(button(), effect).touches
-    (touch,) = [touch for touch in touches if (touch.resting is not None) is is_resting]
-
-    chain = Pressed(
-        smooth_rig(),
-        table(),
-        layout_of(button(), effect),
-        "serial",
-        resting=(touch.resting,) if is_resting else (),
-        is_shaped=False,
-    )
-    ((felt,),) = chain.press(lambda since: touch.at, held=0.42)
-
-    assert touch.frequencies == (felt.frequency,)
-    since, duration = (0.3, 0.1) if isinstance(effect, Buzz) else (0.0, effect.duration)
-    level = felt.level_db_sl(duration, since=since)
-    assert level == pytest.approx(touch.felt_db_sl, abs=1.0)
-    expected = effect.level - touch.held_back_db
-    assert expected - 0.5 <= touch.felt_db_sl <= expected + 2.0
-
-
 def test_check_touches_the_part_of_a_region_that_is_on_the_plate() -> None:
     """A region of 40 mm by 12 mm, half of it beyond the east edge."""
     length = table().plate.length
@@ -117,6 +90,16 @@ def test_check_touches_the_part_of_a_region_that_is_on_the_plate() -> None:
     assert {touch.reason for touch in touches} == {None}
     columns = [touch.at[0] for touch in touches]
     assert length - 0.02 < min(columns) < max(columns) < length
+
+
+def test_check_reports_a_region_beyond_the_plate() -> None:
+    """It has no touches."""
+    rectangle = Rectangle(table().plate.length + 0.02, 0.04, 0.04, 0.012)
+
+    effect_check = checked(Region("beyond", rectangle, on_press="it"), Buzz())
+
+    assert effect_check.touches == ()
+    assert len(effect_check.problems) == 1
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 from cobs import cobs
 
 from cases import shortly
-from drivers.errors import LinkError
+from drivers.errors import CommandError, LinkError
 from drivers.protocol.definition import REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
@@ -147,6 +147,15 @@ def test_amplifier_with_coarse_steps_passes(steps: dict[str, int], names: list[s
     results = judged("serial", names, far=far)
 
     expect_passed(results, set() if names else SKIPPED["serial"] - {"steps_as_stated"})
+
+
+def test_level_below_a_step_is_refused() -> None:
+    """An amplifier that has full level alone cannot be driven at a fifth of it."""
+    far = CoarseAmplifier("coarse", channels=2)
+    far.capabilities.update(level_step=10_000)
+
+    with pytest.raises(CommandError, match="at least 1"):
+        judged("serial", ["stop"], far=far)
 
 
 MINIMUM = {
@@ -325,6 +334,22 @@ def test_malformed_reply_fails_one_check_with_its_bytes(
     assert damaged.hex(" ") in failed.outcome.last_bytes
 
 
+def test_bad_capability_is_a_single_failure() -> None:
+    """Checks that need the steps of envelopes are not run; all others have their verdicts."""
+    far = varied()
+    far.capabilities.update(envelope_step_min=900)
+    names = ["capabilities", "replies_in_time", "stop", "watchdog", "onsets", "endings", "voices"]
+
+    results = judged("serial", names, far=far)
+
+    by_name = {result.check.name: result for result in results}
+    assert names_with(results, "failed") == {"capabilities"}
+    assert "900" in by_name["capabilities"].outcome.expected
+    assert names_with(results, "not_run") == {"onsets", "endings", "voices"}
+    for name in ("onsets", "endings", "voices"):
+        assert "envelope_step_max" in by_name[name].reason
+
+
 def exchange_words(clock: int) -> int:
     """Return a clock of 32 bits with its words exchanged."""
     return (clock & 0xFFFF) << 16 | clock >> 16
@@ -411,6 +436,27 @@ async def test_check_is_repeated_if_this_program_was_late(
 
     assert result.result == verdict
     assert result.attempts == 3
+
+
+@in_virtual_time
+async def test_program_that_is_always_late_has_no_verdict() -> None:
+    """The amplifier neither fails nor passes; the next check is run.
+
+    After 20 s of attempts that came too late no attempt follows, and the reason states it.
+    """
+    with closing(JudgedLine("serial", varied())) as line:
+        run = ConformanceRun(line.client, 0.2)
+        late = await run.check(1, stalling_check([0.11] * 20))
+        punctual = await run.check(2, stalling_check([]))
+        line.client.lateness.wasted = 20.0
+        last = await run.check(1, stalling_check([0.11]))
+
+    assert verdicts_of([late, punctual]) == ["skipped", "passed"]
+    assert isinstance(late.outcome, TooLate)
+    assert ConformanceReport("x", 0.2, (late, punctual), 0).overall == "incomplete"
+    assert isinstance(last.outcome, TooLate)
+    sentence = "no verdict because the time for repetitions is used up: "
+    assert last.reason.startswith(sentence), last.reason
 
 
 def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:

@@ -23,9 +23,9 @@ from era_haptics.lab.design.problem import (
     anywhere,
     area_of,
     candidates_of,
+    contact_rule,
     everywhere,
     layouts_of,
-    shortfall,
 )
 from era_haptics.lab.design.results import Design
 from era_haptics.lab.design.runner import Runner
@@ -40,7 +40,6 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import attached_stiffness
 from model.structure.sources import drive_forces
-from model.structure.statics import static_loads
 
 RIG = load_rig(example_rig_path())
 PLATE = RIG.plate
@@ -154,6 +153,36 @@ def test_refused_design_leaves_no_folder(
 
 
 # Contacts
+
+LAYOUT = """\
+quiet: [2, 2]
+apart: 4 cm
+elsewhere: null
+regions:
+  a: {rectangle: {start: [0, 0], end: [5 cm, 5 cm]}, on_press: click}
+  b: {circle: {at: [20 cm, 10 cm], radius: 4 cm}}
+"""
+
+
+def gaps_between(points: FloatArray) -> FloatArray:
+    """Return the distances of all pairs of points [m]."""
+    distances = np.linalg.norm(points[:, None] - points, axis=-1)
+    return np.asarray(distances[np.triu_indices(len(points), 1)])
+
+
+def test_contacts_are_in_the_regions_of_a_layout(tmp_path: Path) -> None:
+    """Three fingers, 4 cm apart; effects do not matter."""
+    path = tmp_path / "layout.yaml"
+    path.write_text(LAYOUT)
+
+    rule = contact_rule(path, PLATE)
+
+    for contacts in (*rule.sets(20, seed=1), *rule.pooled_sets(10, seed=1)):
+        assert len(contacts) == 3
+        in_rectangle = np.all(contacts <= 0.05, axis=1)
+        in_circle = np.linalg.norm(contacts - [0.2, 0.1], axis=1) <= 0.04
+        np.testing.assert_array_equal(in_rectangle | in_circle, True, err_msg=str(contacts))
+        assert gaps_between(contacts).min() > 0.04
 
 
 # Scores and a dense solve
@@ -323,26 +352,16 @@ def test_score_of_two_contents_is_that_of_the_worse(is_reversed: bool) -> None:
 # Rules for ERAs
 
 
-def test_static_loads_of_a_seesaw() -> None:
-    """Three ERAs at two corners and the middle of the far side carry a quarter, a quarter, half.
+def test_kept_eras_stay_and_all_keep_their_distance() -> None:
+    """A random start is exchanged and moved, 8 cm apart along the edge."""
+    search = LayoutSearch(problem(kept=("SW", "NE"), apart=0.08))
 
-    With the center of mass behind all of them, the plate tips.
-    """
-    corner = RIG.eras[0]
-    eras = [
-        replace(corner, name="a", x=0.0, y=0.0),
-        replace(corner, name="b", x=PLATE.length, y=0.0),
-        replace(corner, name="c", x=PLATE.length / 2, y=PLATE.width),
-    ]
-    at_one_side = [*eras[:2], replace(eras[2], y=0.2 * PLATE.width)]
+    positions = search.from_random(np.random.default_rng(2)).positions
 
-    loads = static_loads(PLATE, eras)
-
-    weight = 9.80665 * PLATE.mass
-    assert loads == pytest.approx([weight / 4, weight / 4, weight / 2])
-    assert shortfall(RIG, eras, lowest=10.0) == 0
-    assert shortfall(RIG, at_one_side, lowest=1.0) > 0
-    assert shortfall(RIG, eras, lowest=1e4) > 0
+    assert positions[:2].tolist() == [[0, 0], [PLATE.length, PLATE.width]]
+    assert gaps_between(positions).min() >= 0.08
+    is_at_edge = area_of("edge", PLATE).contains(positions)
+    np.testing.assert_array_equal(is_at_edge, True)
 
 
 def test_area_without_room_is_refused() -> None:

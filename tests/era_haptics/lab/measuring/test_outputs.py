@@ -91,6 +91,22 @@ def test_accelerometer_finds_swapped_and_backward_outputs(rig: Rig, truth: Truth
     assert [output.verdict == "ok" for output in outputs] == [True, True, False, True]
 
 
+def test_accelerometer_finds_dead_and_weak_outputs(rig: Rig, truth: Truth) -> None:
+    """An output plays nothing, another a quarter as loud: 12 dB, to the 3 dB of tolerances."""
+    outputs = findings(rig, cabled(truth, gains=(1, 0, 1, 0.25)))
+
+    assert [output.era for output in outputs] == ["SW", None, "NE", "NW"]
+    assert "dead" in outputs[1].verdict
+    assert "loose" in outputs[3].verdict
+    assert 20 * np.log10(outputs[3].relative_level) == pytest.approx(-12, abs=3)
+
+
+def test_accelerometer_must_be_moved(rig: Rig, truth: Truth) -> None:
+    """In the middle, all four corners of a symmetric plate are alike."""
+    with pytest.raises(InputError, match="was moved each time"):
+        findings(rig, cabled(truth, distance=1.0))
+
+
 def responses(rig: Rig, points: FloatArray, frequencies: FloatArray) -> ComplexArray:
     """Return the response (eras, frequencies, points) of each exciter at each place."""
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)

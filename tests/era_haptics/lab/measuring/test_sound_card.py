@@ -326,6 +326,15 @@ def test_stopped_measurement_is_resumed(make_bench: MakeBench, ending: str) -> N
     assert {row.sensor for row in read_measured(bench.output)} == set(THREE_PLACES)
 
 
+def test_measurement_that_was_not_started_is_not_resumed(make_bench: MakeBench) -> None:
+    """There is no file."""
+    bench = make_bench()
+
+    assert bench.measure("--resume") == 2
+
+    assert "to go on from" in bench.errors
+
+
 @pytest.mark.parametrize(
     ("options", "cause"),
     [
@@ -381,6 +390,27 @@ def test_sensor_that_was_not_moved_is_noticed(make_bench: MakeBench) -> None:
     assert places["measured"] == ["P1", "P2", "P3"]
     assert bench.errors.count("not kept") == 1
     assert "the sensor is still there; move it to P2" in bench.errors
+
+
+@pytest.mark.parametrize(
+    ("muted", "places", "message"),
+    [
+        (5, ["P1"], "P2 is not kept: output 1 is not heard here"),
+        (0, [], "P1 is not kept: output 1 moves not"),
+    ],
+    ids=["second place", "first place"],
+)
+def test_output_that_was_heard_elsewhere_is_not_called_dead(
+    make_bench: MakeBench, muted: int, places: list[str], message: str
+) -> None:
+    """Silent from the second place on, it may be on a nodal line, which s skips."""
+    bench = make_bench()
+    bench.card.muted = muted
+
+    assert bench.places(keys=["", *[""] * len(places)])["measured"] == places
+
+    assert message in bench.errors
+    assert ("; s skips it" in bench.errors) == bool(places)
 
 
 @pytest.mark.parametrize(

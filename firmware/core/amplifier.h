@@ -137,8 +137,8 @@ static inline uint32_t amplifier_clock(const struct amplifier *amplifier)
     return (uint32_t)((amplifier->clock - (uint64_t)ahead) >> 32);
 }
 
-// Token of a layer that plays, 0 of a silent one.
-uint16_t amplifier_token(const struct amplifier *amplifier, uint8_t layer);
+// Layers that play, a bit each: their tokens are valid.
+uint16_t amplifier_layers(const struct amplifier *amplifier);
 // Milliseconds that the watchdog has left, rounded.
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier);
 

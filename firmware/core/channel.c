@@ -10,15 +10,16 @@ static bool plays_in(const struct voice *voice, uint8_t layer)
 
 // A place for another voice: one that is silent, else that of the fade that ends first. There are
 // as many more places than voices as one set can cut short.
-static struct voice *place(struct channel *channel)
+static struct voice *place(struct channel *channel, uint64_t sample)
 {
     struct voice *first = &channel->voices[0];
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        if (!channel->voices[i].is_playing)
+            return &channel->voices[i];
     for (unsigned i = 0; i < VOICES_KEPT; i++) {
         struct voice *voice = &channel->voices[i];
-        if (!voice->is_playing)
-            return voice;
-        if (voice->level == 0 &&
-            (first->level > 0 || voice_samples_left(voice) < voice_samples_left(first)))
+        if (voice->level == 0 && (first->level > 0 || voice_samples_left(voice, sample) <
+                                                          voice_samples_left(first, sample)))
             first = voice;
     }
     return first;
@@ -30,21 +31,33 @@ static bool is_older(const struct voice *voice, const struct voice *than)
            (voice->since == than->since && voice->number < than->number);
 }
 
-// Cut the oldest fades short where more voices last than there are.
+static bool is_lasting(const struct voice *voice, uint64_t sample)
+{
+    return voice->is_playing && voice_outlasts(voice, SHORTENED_FADE_MS, sample);
+}
+
+// The fade that can be cut short and began first, or null.
+static struct voice *oldest_fade(struct channel *channel, uint64_t sample)
+{
+    struct voice *oldest = NULL;
+    for (unsigned i = 0; i < VOICES_KEPT; i++) {
+        struct voice *voice = &channel->voices[i];
+        if (voice->has_ended && is_lasting(voice, sample) &&
+            (oldest == NULL || is_older(voice, oldest)))
+            oldest = voice;
+    }
+    return oldest;
+}
+
+// Cut the oldest fades short if more voices last than there are.
 static void keep_within(struct channel *channel, uint64_t sample)
 {
-    for (;;) {
-        struct voice *oldest = NULL;
-        unsigned lasting = 0;
-        for (unsigned i = 0; i < VOICES_KEPT; i++) {
-            struct voice *voice = &channel->voices[i];
-            if (!voice->is_playing || !voice_outlasts(voice, SHORTENED_FADE_MS))
-                continue;
-            lasting++;
-            if (voice->has_ended && (oldest == NULL || is_older(voice, oldest)))
-                oldest = voice;
-        }
-        if (lasting <= VOICES || oldest == NULL)
+    unsigned lasting = 0;
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        lasting += is_lasting(&channel->voices[i], sample);
+    while (lasting-- > VOICES) {
+        struct voice *oldest = oldest_fade(channel, sample);
+        if (oldest == NULL)
             return;
         voice_fade(oldest, SHORTENED_FADE_MS, sample);
     }
@@ -68,7 +81,7 @@ void channel_play(struct channel *channel, uint8_t layer, const struct command *
     }
     if (is_driven) {
         if (continued == NULL) {
-            continued = place(channel);
+            continued = place(channel, sample);
             voice_begin(continued, layer, command->frequency, channel->begun++);
         }
         voice_lead(continued, command, ramp, sample);
@@ -89,6 +102,17 @@ const struct voice *channel_voice(const struct channel *channel, uint8_t layer)
         if (plays_in(&channel->voices[i], layer))
             return &channel->voices[i];
     return NULL;
+}
+
+uint16_t channel_layers(const struct channel *channel)
+{
+    uint16_t layers = 0;
+    for (unsigned i = 0; i < VOICES_KEPT; i++) {
+        const struct voice *voice = &channel->voices[i];
+        if (voice->is_playing && !voice->has_ended)
+            layers |= (uint16_t)(1 << voice->layer);
+    }
+    return layers;
 }
 
 bool channel_is_silent(const struct channel *channel)
@@ -113,6 +137,8 @@ uint16_t channel_level(const struct channel *channel, uint32_t clock)
     bool is_counted[VOICES_KEPT] = {false};
     for (unsigned i = 0; i < VOICES_KEPT; i++) {
         int64_t re = 0, im = 0;
+        if (is_counted[i] || !channel->voices[i].is_playing)
+            continue;
         for (unsigned j = i; j < VOICES_KEPT; j++) { // those of one frequency interfere
             const struct voice *voice = &channel->voices[j];
             if (is_counted[j] || !voice->is_playing ||

@@ -26,6 +26,9 @@ void channel_silence(struct channel *channel, uint16_t ramp, uint64_t sample);
 // The voice that a layer plays and that has not ended, or null.
 const struct voice *channel_voice(const struct channel *channel, uint8_t layer);
 
+// Layers with such a voice, a bit each.
+uint16_t channel_layers(const struct channel *channel);
+
 bool channel_is_silent(const struct channel *channel);
 
 // Present level: the largest amplitude of the sum.

@@ -30,7 +30,7 @@ static uint32_t onsets_left(const struct amplifier *amplifier, uint8_t layer)
         const struct voice *voice = channel_voice(&amplifier->channels[i], layer);
         if (voice == NULL || voice->path.knots == 0)
             continue;
-        uint32_t left = voice_samples_left(voice);
+        uint32_t left = voice_samples_left(voice, amplifier->sample);
         last = left > last ? left : last;
     }
     return last;
@@ -43,7 +43,8 @@ static void start(struct amplifier *amplifier, struct layer_head head, struct re
     bool is_named[CHANNELS_MAX] = {false};
     struct layer *layer = &amplifier->layers[head.layer];
     for (uint8_t i = 0; i < head.count; i++) {
-        struct command command = read_command(reader);
+        struct command command;
+        read_command(reader, &command);
         channel_play(&amplifier->channels[command.channel], head.layer, &command, head.ramp,
                      amplifier->sample);
         is_named[command.channel] = true;
@@ -65,7 +66,7 @@ static void wait(struct layer *layer, struct layer_head head, const uint16_t *wo
                  struct reader *reader, uint16_t token, uint32_t samples)
 {
     for (uint8_t i = 0; i < head.count; i++)
-        read_command(reader);
+        skip_command(reader);
     layer->waits = samples;
     layer->waiting_token = token;
     layer->waiting_count = (uint16_t)(reader->at - words);
@@ -161,10 +162,10 @@ void layers_silence(struct amplifier *amplifier, uint16_t ramp)
         channel_silence(&amplifier->channels[i], ramp, amplifier->sample);
 }
 
-uint16_t amplifier_token(const struct amplifier *amplifier, uint8_t layer)
+uint16_t amplifier_layers(const struct amplifier *amplifier)
 {
+    uint16_t layers = 0;
     for (unsigned i = 0; i < CHANNELS; i++)
-        if (channel_voice(&amplifier->channels[i], layer) != NULL)
-            return amplifier->layers[layer].token;
-    return 0;
+        layers |= channel_layers(&amplifier->channels[i]);
+    return layers;
 }

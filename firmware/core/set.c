@@ -36,25 +36,28 @@ struct layer_head read_layer(struct reader *reader)
     return head;
 }
 
-struct command read_command(struct reader *reader)
+void read_command(struct reader *reader, struct command *command)
 {
     uint16_t bits = read_number(reader);
-    struct command command = {
-        .bits = bits,
-        .channel = (uint8_t)FIELD_OF(bits, COMMAND_CHANNEL),
-        .keep_phase = FIELD_OF(bits, COMMAND_KEEP_PHASE),
-        .skip_ending = FIELD_OF(bits, COMMAND_SKIP_ENDING),
-        .has_onset = FIELD_OF(bits, COMMAND_ONSET),
-        .has_ending = FIELD_OF(bits, COMMAND_ENDING),
-    };
-    command.frequency = read_number(reader);
-    command.level = read_number(reader);
-    command.phase = (int16_t)read_number(reader);
-    if (command.has_onset)
-        read_envelope(reader, &command.onset);
-    if (command.has_ending)
-        read_envelope(reader, &command.ending);
-    return command;
+    command->bits = bits;
+    command->channel = (uint8_t)FIELD_OF(bits, COMMAND_CHANNEL);
+    command->keep_phase = FIELD_OF(bits, COMMAND_KEEP_PHASE);
+    command->skip_ending = FIELD_OF(bits, COMMAND_SKIP_ENDING);
+    command->has_onset = FIELD_OF(bits, COMMAND_ONSET);
+    command->has_ending = FIELD_OF(bits, COMMAND_ENDING);
+    command->frequency = read_number(reader);
+    command->level = read_number(reader);
+    command->phase = (int16_t)read_number(reader);
+    if (command->has_onset)
+        read_envelope(reader, &command->onset);
+    if (command->has_ending)
+        read_envelope(reader, &command->ending);
+}
+
+void skip_command(struct reader *reader)
+{
+    struct command command;
+    read_command(reader, &command);
 }
 
 static bool is_amplitude(uint16_t level, int16_t phase)
@@ -87,7 +90,8 @@ static void check_commands(struct reader *reader, uint8_t count)
 {
     uint16_t channels = 0;
     for (uint8_t i = 0; i < count && reader->nak == NAK_NONE; i++) {
-        struct command command = read_command(reader);
+        struct command command;
+        read_command(reader, &command);
         if (command.channel >= CHANNELS || (channels >> command.channel & 1))
             reader_refuse(reader, NAK_BAD_CHANNEL, command.channel);
         channels |= (uint16_t)(1 << command.channel);
@@ -101,7 +105,7 @@ void check_set(struct reader *reader)
     while (reader->left > 0 && reader->nak == NAK_NONE) {
         struct reader whole = *reader;
         for (uint8_t left = read_layer(&whole).count; left > 0; left--)
-            read_command(&whole);
+            skip_command(&whole);
         if (whole.nak != NAK_NONE)
             reader_refuse(reader, whole.nak, NO_CHANNEL);
         struct layer_head head = read_layer(reader);

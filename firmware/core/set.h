@@ -35,9 +35,12 @@ struct layer_head {
     uint16_t ramp, valid_for; // ms
 };
 
-// Read what comes next, whatever its numbers; only where the stream ends the reader refuses it.
+// Read a layer or a command with any values; the reader refuses it if the stream ends. An envelope is
+// read only if the command has it.
 struct layer_head read_layer(struct reader *reader);
-struct command read_command(struct reader *reader);
+void read_command(struct reader *reader, struct command *command);
+// Skip a command.
+void skip_command(struct reader *reader);
 
 // Refuse what ends amid a layer, or is not what this amplifier plays, the first that is found.
 void check_set(struct reader *reader);

@@ -19,7 +19,16 @@
 // those that we know shift negative numbers arithmetically.
 static inline int32_t times(int32_t a, int32_t b)
 {
+#if defined __ARM_ARCH_6M__ // products have 32 bits: the same result by four products of halves
+    int32_t a_high = a >> 16, b_high = b >> 16, a_low = a & 0xFFFF, b_low = b & 0xFFFF;
+    int32_t left = a_high * b_low + (int32_t)((uint32_t)a_low * (uint32_t)b_low >> 16);
+    int32_t right = a_low * b_high;
+    int32_t carry = ((left & 0x3FFF) + (right & 0x3FFF)) >> 14; // of the lowest bits that count
+    uint32_t high = (uint32_t)(a_high * b_high) << 2;
+    return (int32_t)(high + (uint32_t)((left >> 14) + (right >> 14) + carry));
+#else
     return (int32_t)(((int64_t)a * b) >> 30);
+#endif
 }
 
 // Sine of an angle; the error is at most 7e-7 (-123 dB).

@@ -6,22 +6,41 @@
 #define PHASE_TURN (360 * PHASE_PER_UNIT)
 #define WHOLE (UINT64_C(1) << 32)
 
+// In 32 bits, because small processors divide 64 bits in a loop: x * whole / n is rounded down as
+// x * (whole / n) + x * (whole % n) / n.
 static struct complex amplitude_of(uint16_t level, int16_t phase)
 {
     uint32_t turn = (uint32_t)(phase < 0 ? phase + PHASE_TURN : phase);
-    uint32_t angle = (uint32_t)(((uint64_t)turn << 32) / PHASE_TURN);
-    int32_t size = (int32_t)(((int64_t)level * ONE) / LEVEL_PER_UNIT);
+    uint32_t angle = turn * (uint32_t)(WHOLE / PHASE_TURN) +
+                     turn * (uint32_t)(WHOLE % PHASE_TURN) / PHASE_TURN;
+    int32_t size = level * (ONE / LEVEL_PER_UNIT) + level * (ONE % LEVEL_PER_UNIT) / LEVEL_PER_UNIT;
     struct complex amplitude = {.re = times(size, cosine(angle)), .im = times(size, sine(angle))};
     return amplitude;
+}
+
+// Whole turns, divided and rounded up; at most UINT32_MAX. Nearly always in 32 bits.
+static uint32_t parts_of(uint32_t turns, uint32_t divisor)
+{
+    if (divisor % turns == 0 && divisor > turns)
+        return UINT32_MAX / (divisor / turns) + 1;
+    uint64_t parts = (turns * WHOLE + divisor - 1) / divisor;
+    return parts > UINT32_MAX ? UINT32_MAX : (uint32_t)parts;
 }
 
 // Progress per sample of what takes so many tenths of a millisecond, rounded up, so that the end
 // comes with the last sample and not one later.
 static uint32_t stride_of(uint32_t tenths)
 {
-    uint64_t tenth_samples = (uint64_t)tenths * SAMPLES_PER_MS;
-    uint64_t stride = tenth_samples > 0 ? (10 * WHOLE + tenth_samples - 1) / tenth_samples : 0;
-    return stride > UINT32_MAX ? UINT32_MAX : (uint32_t)stride;
+    uint32_t tenth_samples = tenths * SAMPLES_PER_MS;
+    if (tenth_samples == 0)
+        return 0;
+    return parts_of(10, tenth_samples);
+}
+
+// Samples of a way of some lines, at a stride.
+static uint32_t samples_of(uint32_t lines, uint32_t stride)
+{
+    return stride > 0 ? parts_of(lines, stride) : 0;
 }
 
 static int32_t between(int32_t from, int32_t to, int32_t way)
@@ -65,6 +84,7 @@ static void send(struct voice *voice, const struct envelope *shape, uint16_t ram
         voice->path = *shape;
     voice->along = 0;
     voice->stride = stride_of(shape != NULL ? shape->step : 10u * ramp);
+    voice->still_at = (uint32_t)sample + samples_of(voice->path.knots + 1u, voice->stride);
     voice->to = target(voice, 0);
     voice->next = 1;
     stop_if_silent(voice);
@@ -91,15 +111,10 @@ void voice_lead(struct voice *voice, const struct command *command, uint16_t ram
         voice->ending = command->ending;
 }
 
-bool voice_outlasts(const struct voice *voice, uint16_t milliseconds)
-{
-    return voice->level > 0 || voice_samples_left(voice) > (uint32_t)milliseconds * SAMPLES_PER_MS;
-}
-
 void voice_fade(struct voice *voice, uint16_t ramp, uint64_t sample)
 {
     voice->has_ended = true;
-    if (voice_outlasts(voice, ramp))
+    if (voice_outlasts(voice, ramp, sample))
         send(voice, NULL, ramp, 0, 0, sample);
 }
 
@@ -111,14 +126,6 @@ void voice_end(struct voice *voice, uint16_t ramp, uint64_t sample)
     }
     voice->has_ended = true;
     send(voice, &voice->ending, ramp, 0, 0, sample);
-}
-
-uint32_t voice_samples_left(const struct voice *voice)
-{
-    if (voice->stride == 0)
-        return 0;
-    uint64_t left = (uint64_t)(voice->path.knots + 1 - voice->next) * WHOLE + WHOLE - voice->along;
-    return (uint32_t)((left + voice->stride - 1) / voice->stride);
 }
 
 static void move_on(struct voice *voice)

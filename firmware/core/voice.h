@@ -30,6 +30,7 @@ struct voice {
     bool has_ending;
     struct envelope ending;   // how it falls silent by itself
     uint64_t since;           // sample at which it was sent on its way
+    uint32_t still_at;        // sample (low bits) at which it stands still, while its stride is not 0
     uint32_t number;          // of voices, in the order of their beginnings
 };
 
@@ -45,11 +46,18 @@ void voice_fade(struct voice *voice, uint16_t ramp, uint64_t sample);
 // Let it fall silent along its ending, or along a ramp [ms] without one.
 void voice_end(struct voice *voice, uint16_t ramp, uint64_t sample);
 
-// Samples until it stands still.
-uint32_t voice_samples_left(const struct voice *voice);
+// Samples from a sample on until it stands still.
+static inline uint32_t voice_samples_left(const struct voice *voice, uint64_t sample)
+{
+    return voice->stride > 0 ? voice->still_at - (uint32_t)sample : 0;
+}
 
 // Whether it is not silent within a time [ms] by itself.
-bool voice_outlasts(const struct voice *voice, uint16_t milliseconds);
+static inline bool voice_outlasts(const struct voice *voice, uint16_t milliseconds, uint64_t sample)
+{
+    uint32_t samples = (uint32_t)milliseconds * SAMPLES_PER_MS;
+    return voice->level > 0 || voice_samples_left(voice, sample) > samples;
+}
 
 // Value at this sample, at a time of the clock, in units of 2^-30 of full level; then move on by one.
 int32_t voice_sample(struct voice *voice, uint32_t clock);

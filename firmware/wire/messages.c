@@ -79,10 +79,11 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
                 (amplifier->measured.is_interlock_open ? FLAG_INTERLOCK_OPEN : 0) |
                 (amplifier->is_limited ? FLAG_LIMITED : 0);
     const uint32_t clock = (uint32_t)(amplifier->clock >> 32);
+    const uint16_t playing = amplifier_layers(amplifier);
     for (unsigned i = 0; i < CHANNELS; i++)
         levels[i] = channel_level(&amplifier->channels[i], clock);
     for (uint8_t i = 0; i < LAYERS; i++)
-        tokens[i] = amplifier_token(amplifier, i);
+        tokens[i] = playing >> i & 1 ? amplifier->layers[i].token : 0;
     struct wire_status status = {
         .state = (uint16_t)amplifier->state,
         .fault = (uint16_t)amplifier->fault,
@@ -149,12 +150,9 @@ static enum nak reply_achieved(struct words *reply, const struct amplifier *ampl
     if (number >= LAYERS)
         return NAK_BAD_VALUE;
     struct wire_command commands[CHANNELS_MAX];
-    struct wire_achieved achieved = {
-        .token = amplifier_token(amplifier, (uint8_t)number),
-        .layer = (uint8_t)number,
-        .commands = commands,
-    };
-    if (achieved.token > 0) {
+    struct wire_achieved achieved = {.layer = (uint8_t)number, .commands = commands};
+    if (amplifier_layers(amplifier) >> number & 1) {
+        achieved.token = amplifier->layers[number].token;
         achieved.ramp = amplifier->layers[number].ramp;
         achieved.valid_for = amplifier->layers[number].valid_for;
     }

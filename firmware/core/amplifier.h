@@ -107,6 +107,9 @@ void amplifier_time(struct amplifier *amplifier, uint64_t now);
 // Enter the fault reaction, whether the high voltage is on or not.
 void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t channel);
 
+// Enter a fault and fall silent with the next sample, without a ramp: samples come too late for one.
+void amplifier_overload(struct amplifier *amplifier);
+
 // Hand over what the board measures; an open interlock or another cause of a fault acts at once.
 void amplifier_measured(struct amplifier *amplifier, struct measured measured);
 

@@ -57,6 +57,12 @@
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
+// ms by which samples can be late: beyond that the converter has run dry, which is a fault. Bytes are
+// read at least every quarter of this time.
+#ifndef LATE_MAX
+#define LATE_MAX 4
+#endif
+
 #define CLOCK_ERROR 10 // 0.1 us; board_samples_due knows microseconds
 
 #define FAULTS_KEPT 16

@@ -19,8 +19,10 @@ static uint32_t samples_to_measuring;
 static uint8_t stored[3]; // addresses, of each line
 static bool is_high_voltage;
 
-// After a longer time every watchdog has expired, and every ramp ended.
-#define SAMPLES_LATE_MAX ((WATCHDOG_MAX + RAMP_MAX) * SAMPLES_PER_MS)
+static uint32_t overdue; // samples that are due and not made yet
+
+#define OVERDUE_MAX (LATE_MAX * SAMPLES_PER_MS)
+#define TURN (LATE_MAX * 1000 / 4) // us; longest time between two looks for bytes
 
 static void send_can(const struct can_frame *frame)
 {
@@ -73,26 +75,47 @@ static void switch_high_voltage(void)
         measure();
 }
 
-void loop_samples(void)
+// Overload: leave out the samples that are late, and fall silent.
+static void give_up(uint64_t now)
+{
+    amplifier_skip(&amplifier, overdue);
+    overdue = 0;
+    amplifier_time(&amplifier, now); // an expired watchdog is the fault in its place
+    amplifier_overload(&amplifier);
+}
+
+static void make_sample(void)
 {
     int16_t samples[CHANNELS_MAX];
+    if (samples_to_measuring-- == 0) { // every millisecond
+        samples_to_measuring = SAMPLES_PER_MS - 1;
+        measure();
+    }
+    amplifier_sample(&amplifier, samples);
+    board_output(samples);
+    overdue--;
+}
+
+// By how much the next sample comes out later than now: without overdue samples this is `ahead`.
+static int32_t ahead_of_overdue(int32_t ahead)
+{
+    int64_t left = ahead - (int64_t)overdue * 65536;
+    return left > 0 ? (int32_t)left : 0;
+}
+
+void loop_samples(void)
+{
+    int32_t ahead;
     uint64_t now = board_microseconds();
-    uint32_t due = board_samples_due(&amplifier.ahead);
-    if (due > SAMPLES_LATE_MAX) {
-        amplifier_skip(&amplifier, due - SAMPLES_LATE_MAX);
-        due = SAMPLES_LATE_MAX;
-    }
+    overdue += board_samples_due(&ahead);
+    if (overdue > OVERDUE_MAX)
+        give_up(now);
     amplifier.heard = 0;
-    uint64_t span = (uint64_t)due * 1000000 / SAMPLE_RATE;
+    uint64_t span = (uint64_t)overdue * 1000000 / SAMPLE_RATE;
     amplifier_time(&amplifier, now > span ? now - span : 0); // of the first one
-    for (; due > 0; due--) {
-        if (samples_to_measuring-- == 0) { // every millisecond
-            samples_to_measuring = SAMPLES_PER_MS - 1;
-            measure();
-        }
-        amplifier_sample(&amplifier, samples);
-        board_output(samples);
-    }
+    while (overdue > 0 && board_microseconds() - now < TURN)
+        make_sample();
+    amplifier.ahead = ahead_of_overdue(ahead);
     amplifier_time(&amplifier, now);
     switch_high_voltage();
 }
@@ -156,7 +179,7 @@ struct modbus *loop_modbus(void)
     return &modbus;
 }
 
-void loop_once(void)
+bool loop_once(void)
 {
     loop_samples();
     serve_serial();
@@ -165,4 +188,5 @@ void loop_once(void)
     store(LINE_SERIAL, serial.address);
     store(LINE_MODBUS, modbus.unit);
     store(LINE_CAN, node.number);
+    return overdue == 0;
 }

@@ -119,10 +119,23 @@ void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t chann
     leave(amplifier, FAULT_REACTION_ACTIVE, SAFETY_RAMP, channel);
 }
 
+static bool can_fail(const struct amplifier *amplifier)
+{
+    return amplifier->state >= SWITCHED_ON && amplifier->state <= QUICK_STOP_ACTIVE;
+}
+
+void amplifier_overload(struct amplifier *amplifier)
+{
+    if (can_fail(amplifier))
+        amplifier_fail(amplifier, FAULT_INTERNAL, NO_CHANNEL);
+    amplifier_silence(amplifier, 0);
+    settle(amplifier);
+}
+
 void amplifier_measured(struct amplifier *amplifier, struct measured measured)
 {
     amplifier->measured = measured;
-    if (amplifier->state < SWITCHED_ON || amplifier->state > QUICK_STOP_ACTIVE)
+    if (!can_fail(amplifier))
         return;
     if (measured.is_interlock_open)
         amplifier_fail(amplifier, FAULT_INTERLOCK, NO_CHANNEL);

@@ -22,6 +22,7 @@ uint32_t board_samples_due(int32_t *ahead)
 
 void board_output(const int16_t samples[CHANNELS])
 {
+    memory.now += memory.sample_time;
     if (memory.samples_length + CHANNELS > SAMPLES_MAX)
         return;
     memcpy(memory.samples + memory.samples_length, samples, CHANNELS * sizeof samples[0]);

@@ -22,6 +22,7 @@ extern struct memory {
     int16_t samples[SAMPLES_MAX];
     uint32_t samples_length; // of all channels, not fetched yet
     bool is_interlock_open;
+    uint32_t sample_time; // us; that making a sample takes
     uint8_t addresses[LINES];
 } memory;
 

@@ -24,6 +24,7 @@ void moved_begin(uint32_t buffered)
     memory.samples_length = 0;
     memory.buffered = buffered;
     memory.is_interlock_open = false;
+    memory.sample_time = 0;
     loop_init();
 }
 
@@ -31,7 +32,8 @@ void moved_to(uint64_t time)
 {
     while (memory.now < time) {
         memory.now = time - memory.now > STEP ? memory.now + STEP : time;
-        loop_once();
+        while (!loop_once()) {
+        }
     }
 }
 
@@ -41,6 +43,17 @@ void moved_stall(uint64_t time, bool is_converter_still)
     if (is_converter_still)
         memory.samples_counted += (time - memory.now) * SAMPLE_RATE / 1000000;
     memory.now = time;
+}
+
+// Let making a sample take a time [us] from now on.
+void moved_load(uint32_t sample_time)
+{
+    memory.sample_time = sample_time;
+}
+
+uint64_t moved_now(void)
+{
+    return memory.now;
 }
 
 // The samples that were made since the last call, the channels one after another; return how many.

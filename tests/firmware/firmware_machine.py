@@ -187,6 +187,7 @@ class MovedFirmware:
         self._library = ctypes.CDLL(str(folder / "era-moved.so"))
         self._library.moved_to.argtypes = [ctypes.c_uint64]
         self._library.moved_stall.argtypes = [ctypes.c_uint64, ctypes.c_bool]
+        self._library.moved_now.restype = ctypes.c_uint64
         self._sent = ctypes.create_string_buffer(_RING)
         self._made = np.empty(_SAMPLES, np.int16)
         self._channels = channels
@@ -199,6 +200,15 @@ class MovedFirmware:
     def stall(self, time: float, *, is_converter_still: bool) -> None:
         """Let its loop stand still until a time [s], and its converter take nothing meanwhile."""
         self._library.moved_stall(round(time * 1e6), is_converter_still)
+
+    def load(self, sample_time: float) -> None:
+        """Let making a sample take a time [s] from now on."""
+        self._library.moved_load(round(sample_time * 1e6))
+
+    @property
+    def time(self) -> float:
+        """Its clock [s], which advances by itself under load."""
+        return float(self._library.moved_now() / 1e6)
 
     def receive(self, line: int, data: bytes) -> None:
         """Take bytes that arrive on a line now."""

@@ -70,6 +70,7 @@ from tests.firmware.firmware_machine import (
     Sent,
     apply,
     arm,
+    build_firmware,
     replay,
     request,
     running_firmware,
@@ -651,3 +652,68 @@ def test_high_voltage_is_measured_as_soon_as_it_is_switched(replaying: Path) -> 
         status = values_of(firmware, hand.GET_STATUS)
         readings.add((status["flags"], status["high_voltage"]))
     assert readings == {(1, 1800), (0, 0)}
+
+
+@pytest.fixture(scope="module")
+def in_real_time(compiled: Path) -> Path:
+    """The firmware as for a board, where samples can be at most 4 ms late."""
+    return build_firmware(compiled / "in-real-time", "era-moved.so", "NOT_REAL_TIME=")
+
+
+def playing(folder: Path) -> MovedFirmware:
+    """Firmware that has played a tone on channel 0 for 0.1 s."""
+    firmware = MovedFirmware(folder)
+    firmware.receive(SERIAL, arm(250))
+    firmware.receive(SERIAL, apply(1, command(0, 100, 0.5)))
+    firmware.move(0.1)
+    firmware.samples()
+    return firmware
+
+
+@pytest.mark.parametrize("sample_time", [70e-6, 100e-6, 500e-6])
+def test_overload_is_a_fault_and_silent(in_real_time: Path, sample_time: float) -> None:
+    """Samples that take longer than 62.5 us: FAULT_INTERNAL within 0.1 s, before the watchdog."""
+    firmware = playing(in_real_time)
+    firmware.load(sample_time)
+    firmware.move(0.2)
+    firmware.samples()
+    firmware.move(firmware.time + 0.01)
+    samples = firmware.samples()
+    firmware.load(0.0)
+    firmware.move(firmware.time + 0.01)
+
+    assert len(samples) > 0
+    assert not samples.any()
+    status = values_of(firmware, hand.GET_STATUS)
+    assert status["state"] == hand.FAULT
+    assert status["fault"] == FAULTS["INTERNAL"]
+    firmware.receive(SERIAL, request(hand.CLEAR, status["latch"]))
+    assert values_of(firmware, hand.GET_STATUS)["state"] == STATES["SWITCH_ON_DISABLED"]
+
+
+def test_load_below_the_sample_time_is_no_fault(in_real_time: Path) -> None:
+    """At 80 % load, after a request that has taken 3 ms, it catches up and plays every sample."""
+    firmware = playing(in_real_time)
+    firmware.load(50e-6)
+    firmware.stall(0.103, is_converter_still=False)
+    firmware.move(0.2)
+
+    assert len(firmware.samples()) == pytest.approx(0.1 * RATE, abs=0.002 * RATE)
+    assert values_of(firmware, hand.GET_STATUS)["state"] == hand.ENABLED
+
+
+@pytest.mark.parametrize("sample_time", [50e-6, 70e-6, 500e-6])
+def test_stop_takes_effect_within_10_ms_under_load(in_real_time: Path, sample_time: float) -> None:
+    """While samples of 3.5 ms are late, bytes are read: the stop is latched and acknowledged."""
+    firmware = playing(in_real_time)
+    firmware.load(sample_time)
+    firmware.stall(0.1035, is_converter_still=False)
+    firmware.sent(SERIAL)
+
+    firmware.receive(SERIAL, request(hand.STOP, 0))
+
+    assert len(firmware.sent(SERIAL)) > 0
+    assert firmware.time - 0.1035 < 0.01
+    firmware.samples()
+    firmware.move(firmware.time + 0.02)
+    assert not firmware.samples().any()

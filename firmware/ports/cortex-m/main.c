@@ -11,8 +11,9 @@ int main(void)
     board_open();
     loop_init();
     for (;;) {
-        loop_once();
+        bool is_idle = loop_once();
         board_feed_watchdog();
-        board_wait();
+        if (is_idle)
+            board_wait();
     }
 }

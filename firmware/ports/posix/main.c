@@ -12,8 +12,9 @@ int main(int count, char **arguments)
     board_open(count, arguments);
     loop_init();
     for (;;) {
-        loop_once();
+        bool is_idle = loop_once();
         tcp_serve(loop_modbus(), loop_samples);
-        board_wait();
+        if (is_idle)
+            board_wait();
     }
 }

@@ -46,6 +46,7 @@ from model.config.document import ConfigError as ConfigError
 from model.errors import InputError as InputError
 from model.estimate.calibration_result import Calibration as Calibration
 from model.finger import Grid as Grid
+from model.finger import detection_threshold as detection_threshold
 from model.reduction.supported_plate import SupportedModes as SupportedModes
 from model.rig.rig import Rig as Rig
 from model.rig.rig import Uncertainty as Uncertainty

@@ -6,9 +6,9 @@ rings about the center, at Gauss-Lobatto points of the radius squared, with even
 outermost ring is the rim, so the largest value over the points is close to the maximum over the
 disc. If an edge of the plate cuts the disc, the mean is over the remaining part.
 
-A set of detection thresholds is a file in model/data/thresholds with its sources; the file's name
-is the name of the set. Measured thresholds differ by tens of decibels between ways to touch
-(docs/concepts/people.md).
+A set of detection thresholds is a file in model/data/thresholds with its sources, or in a folder of
+the user; the file's name is the name of the set. Measured thresholds differ by tens of decibels
+between ways to touch (docs/concepts/people.md).
 
 Pacinian corpuscles in the skin feel vibration up to about 1 kHz. At higher frequencies, an onset
 contains ringing of the fingertip's contact mass and of modes far above the drive. Models with
@@ -16,10 +16,13 @@ different numbers of modes disagree about this ringing; `felt_part` removes it.
 """
 
 import csv
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,32 +211,60 @@ FELT_DB_SL = 12.0
 STRONG_DB_SL = 20.0
 """Level at which a vibration is strong."""
 
-_FOLDER = resources.files("model").joinpath("data/thresholds")
+THRESHOLD_FOLDER_VARIABLE = "ERA_HAPTICS_THRESHOLDS"
+"""Environment variable with a folder of further threshold sets, such as those of a study."""
 
-_FILES = [file.name for file in _FOLDER.iterdir() if file.name.endswith(".csv")]
 
-THRESHOLDS = tuple(sorted([name.removesuffix(".csv") for name in _FILES]))
-"""Names of the sets of detection thresholds."""
+def _files_in(folder: Traversable) -> dict[str, Traversable]:
+    """Return the files of threshold sets in a folder, by the name of the set; none without it."""
+    if not folder.is_dir():
+        return {}
+    files = [file for file in folder.iterdir() if file.name.endswith(".csv")]
+    return {file.name.removesuffix(".csv"): file for file in files}
+
+
+_PUBLISHED_FILES = _files_in(resources.files("model").joinpath("data/thresholds"))
+_OWN_FOLDER = os.environ.get(THRESHOLD_FOLDER_VARIABLE)
+_OWN_FILES = _files_in(Path(_OWN_FOLDER)) if _OWN_FOLDER else {}
+_FILES = _OWN_FILES | _PUBLISHED_FILES  # a published name keeps its meaning
+
+PUBLISHED_THRESHOLDS = tuple(sorted(_PUBLISHED_FILES))
+"""Names of the published sets of detection thresholds."""
+
+THRESHOLDS = tuple(sorted(_FILES))
+"""Names of all sets of detection thresholds."""
 
 
 @cache
 def _rows(threshold: str) -> list[dict[str, str]]:
-    text = _FOLDER.joinpath(f"{threshold}.csv").read_text(encoding="utf-8")
+    text = _FILES[threshold].read_text(encoding="utf-8")
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
 
 
 @cache
 def _tabulated(threshold: str) -> tuple[FloatArray, FloatArray]:
     """Return the tabulated frequencies [Hz] and peak accelerations [m/s²] of a set."""
-    rows = _rows(threshold)
-    frequency = np.array([float(row["frequency_hz"]) for row in rows])
-    return frequency, np.array([float(row["threshold_m_s2_peak"]) for row in rows])
+    try:
+        rows = _rows(threshold)
+        frequency = np.array([float(row["frequency_hz"]) for row in rows])
+        acceleration = np.array([float(row["threshold_m_s2_peak"]) for row in rows])
+        is_valid = len(rows) > 0 and bool(
+            (np.diff(frequency) > 0).all() and frequency[0] > 0 and (acceleration > 0).all()
+        )
+    except (OSError, KeyError, TypeError, ValueError):
+        is_valid = False
+    if not is_valid:
+        raise InputError(
+            f"{_FILES[threshold]} must have the columns frequency_hz (ascending), "
+            "threshold_m_s2_peak and basis, with positive numbers"
+        )
+    return frequency, acceleration
 
 
 @cache
 def highest_measured(threshold: str = DEFAULT_THRESHOLD) -> float:
     """Return the frequency [Hz] above which a set of thresholds is extrapolated."""
-    measured = [row for row in _rows(threshold) if row["basis"] != "extrapolated"]
+    measured = [row for row in _rows(threshold) if row.get("basis") != "extrapolated"]
     return max([float(row["frequency_hz"]) for row in measured])
 
 

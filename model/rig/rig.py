@@ -15,7 +15,7 @@ from typing import Any
 
 from model.config.document import Document
 from model.errors import InputError, expect_between
-from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
+from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, PUBLISHED_THRESHOLDS
 from model.spectral.plate_mesh import PlateMesh
 from model.structure.attachments import FEET_DEVIATE, PointLoad, feet_of
 from model.structure.exciter import Actuator
@@ -214,7 +214,7 @@ class Rig:
     """Load of each finger on the plate; None for massless fingers."""
     threshold: str = DEFAULT_THRESHOLD
     """Name of the threshold set to which levels are relative (`model.finger`)."""
-    promised_thresholds: tuple[str, ...] = THRESHOLDS
+    promised_thresholds: tuple[str, ...] = PUBLISHED_THRESHOLDS
     """Threshold sets for which promises hold, in addition to `threshold`."""
     supports: tuple[str, ...] = ()
     """Names of the ERAs without an amplifier."""

@@ -33,7 +33,7 @@ from model.config.units import (
     Dimension,
 )
 from model.errors import InputError
-from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
+from model.finger import DEFAULT_THRESHOLD, PUBLISHED_THRESHOLDS
 from model.rig.actuator_keys import ActuatorOfAnyKind
 from model.rig.key_types import (
     AttachedMass,
@@ -469,7 +469,7 @@ class RigSection(Section):
 
     promised_thresholds: Annotated[
         list[ThresholdSet],
-        Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
+        Field(min_length=1, default_factory=lambda: [*PUBLISHED_THRESHOLDS]),
     ]
     """Threshold sets for which promises hold: the set with the lowest promise counts, and
     `threshold` always counts. Default: all published sets. To base promises on `threshold` alone,

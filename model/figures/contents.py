@@ -40,11 +40,12 @@ def contents_figure(
     """
     count = len(contents)
     levels = np.array([_levels(table, layer) for layer in contents])
-    main_width = PAGE_WIDTH / (1 + 1 / count) - 0.4
+    main_share = max(count, 2)  # width of the main panel, relative to the others
+    main_width = PAGE_WIDTH / (1 + 1 / main_share) - 0.4
     height = main_width * table.plate.width / table.plate.length + 1.1
     figure = Figure(figsize=(PAGE_WIDTH, height), layout="constrained")
     panels = figure.subplot_mosaic(
-        [["all", f"{number}"] for number in range(count)], width_ratios=[count, 1]
+        [["all", f"{number}"] for number in range(count)], width_ratios=[main_share, 1]
     )
     main = panels["all"]
     _draw_contents(main, table, levels, CONTENT_COLORS, fingers)

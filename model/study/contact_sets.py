@@ -30,6 +30,11 @@ def random_contacts(
     InputError if no set of positions fits in a number of tries.
     """
     sides = np.array([plate.length, plate.width])
+    if 2 * margin > sides.min():
+        raise InputError(
+            f"fingers must be {1000 * margin:g} mm from the edges, got a plate of "
+            f"{plate.length:g} x {plate.width:g} m; use a larger plate"
+        )
     for _ in range(tries):
         positions = rng.uniform(margin, sides - margin, (count, 2))
         if least_gap(positions) >= apart and plate.covers(positions).all():

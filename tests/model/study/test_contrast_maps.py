@@ -32,6 +32,7 @@ from model.errors import InputError
 from model.finger import Grid
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.plate import AirGap, Laminate, LaminateLayer
+from model.study.contact_sets import random_contacts
 from model.study.promise_cost import PromiseCost, clock_cost, tolerance_costs
 from model.study.table_export import export_csv, export_mat
 from model.study.weak_cells import (
@@ -375,3 +376,11 @@ def test_weak_and_feasible_follow_from_12_db() -> None:
     assert weak.feasible.tolist() == [True, True, False, False]
     assert weak.weak.tolist() == [False, True, True, True]
     assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
+
+
+def test_fingers_do_not_fit_on_a_plate_narrower_than_a_fingertip() -> None:
+    """25 mm between the edges leave no position that is 13 mm from both."""
+    narrow = replace(smooth_rig().plate, width=0.025)
+
+    with pytest.raises(InputError, match="larger plate"):
+        random_contacts(np.random.default_rng(0), 1, narrow, margin=0.013)

@@ -80,7 +80,8 @@ async def test_browser_shows_the_page_without_requests_or_complaints(
     assert tab.complaints == []
     assert NAME in (await texts(tab, "header p"))[0]
     (command,) = await texts(tab, "footer code")
-    assert command == "era plate page 'plate <1> & 2.yaml' -o 'plate <1> & 2.html'"
+    arguments = ["'plate <1> & 2.yaml'", "--sensors SENSORS.csv", "-o 'plate <1> & 2.html'"]
+    assert command == " ".join(["era plate page", *arguments])
 
 
 async def test_page_prints_on_three_sheets_to_scale(tab: Page, page_file: Path) -> None:

@@ -128,5 +128,9 @@ def _figures(report: RigReport, levels: FloatArray) -> dict[str, str]:
 
 def _command(report: RigReport) -> str:
     """Return the command that writes the page in the folder of the rig file."""
-    output = PurePath(report.source).with_suffix(".html").name
-    return shlex.join(["era", "plate", "page", report.source, "-o", output])
+    source = PurePath(report.source)
+    if source.suffix not in (".yaml", ".yml"):
+        return 'era.page(rig, "rig.html")'  # a rig that Python built
+    sensors = ["--sensors", "SENSORS.csv"] if report.sensors else []
+    output = source.with_suffix(".html").name
+    return shlex.join(["era", "plate", "page", source.name, *sensors, "-o", output])

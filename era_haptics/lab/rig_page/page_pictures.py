@@ -53,7 +53,8 @@ STYLE: dict[str, Any] = {
 """Settings of matplotlib while the figures of a page are drawn."""
 
 _WIDTH = 7.3  # in; printed width of a page
-_SCALES = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 50)
+_HIGHEST = 4.3  # in; leaves room for the drawing on the same page
+_SCALES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 50)
 _DRAWING = 3.7, 3.0  # in; space for a plate
 _MARGINS = 0.42, 0.6, 0.42, 0.1  # in; left, right, below, above a plate
 _MARKS = {"solid": ("s", _ACCENT), "dashed": ("o", _CURVE), "dotted": ("x", _FAINT)}
@@ -108,7 +109,7 @@ def drawing_picture(report: RigReport) -> Figure:
 def _draw_outline(axes: Axes, report: RigReport, board: Point) -> None:
     """Draw the outline of a plate, or the rings of a surface [mm]."""
     surface = report.rig.plate.surface
-    if surface is None:
+    if surface is None or not surface.outline:
         axes.add_patch(Rectangle((0, 0), *board, fc=_FILL, ec=_INK, lw=1))
         return
     for ring in surface.outline:
@@ -167,13 +168,17 @@ def fingers_picture(report: RigReport) -> Figure | None:
     """Draw three fingers with three vibrations and their promises; None if there is no answer."""
     if report.answer is None:
         return None
-    return contents_figure(report.table, report.answer.layers, report.answer.promised_fingers)
+    answer = report.answer
+    figure = contents_figure(report.table, answer.layers, answer.promised_fingers)
+    figure.set_figheight(min(figure.get_figheight(), _HIGHEST))
+    return figure
 
 
 def maps_picture(report: RigReport) -> Figure:
     """Draw the contrast promised to a finger anywhere, in bands of 6 dB, with the other fingers."""
     length, width = 1000 * report.rig.plate.length, 1000 * report.rig.plate.width
-    figure = Figure(figsize=(_WIDTH, min(3.0 * width / length + 0.6, 3.4)), layout="compressed")
+    height = min(max(3.0 * width / length + 0.7, 1.6), 3.4)
+    figure = Figure(figsize=(_WIDTH, height), layout="compressed")
     panels = figure.subplots(1, len(report.maps))
     for axes, contrast_map in zip(panels, report.maps, strict=True):
         # No contrast under another finger, nor where the level is not reached.
@@ -189,7 +194,7 @@ def maps_picture(report: RigReport) -> Figure:
             axes.add_patch(Circle(position, 1000 * FINGERTIP_RADIUS, fc=_SKIN, ec=_RIM))
         share = 100 * (contrasts >= OWN_CONTRAST_DB).mean()
         others = "one finger" if len(contrast_map.quiet) == 1 else "two fingers"
-        axes.set_title(f"against {others}: own on {share:.0f} % of the plate")
+        axes.set_title(f"against {others}:\nown on {share:.0f} %")
     figure.colorbar(bands, ax=list(panels), aspect=30, pad=0.02, label="promised contrast / dB")
     return figure
 

@@ -102,7 +102,7 @@ def modes(report: RigReport) -> Iterator[tuple[str, str, str]]:
 def advice(report: RigReport) -> str:
     """Return which tolerance to measure first."""
     if not report.costs:
-        return "No tolerance costs contrast: the rig counts as exactly known, or is too small."
+        return "None: tolerances are zero, or the plate is too small or too weak for two fingers."
     key, cost = next(iter(report.costs.items()))
     return (
         "Promised contrast between two fingers if a tolerance were zero. Measure first: "

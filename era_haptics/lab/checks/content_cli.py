@@ -1,7 +1,7 @@
 """`era content check` and `era play`: content on a simulated plate, or at a finger of a daemon."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,7 +21,7 @@ from model.errors import InputError
 from model.quantities import counted, percent, percent_down
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from controller.content.pattern import Pattern
     from era_haptics.lab.checks.content_check import CheckedContent, Part
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _RATE = 48000  # Hz; every audio player supports it with 16 bits
 _MAX_SAMPLE = (1 << 15) - 1  # of 16 bits
 _FULL_SCALE = 20.0  # m/s²; contents at 20 dB SL reach 3 to 5
+_MAX_COLUMNS = 8  # of a picture
 _ROWS = 12  # of levels over time
 _REMEDY = "try another position (--at), another sharpness, slower rises or a lower --level"
 
@@ -255,6 +256,89 @@ def check(
         is_kept = _check_one(contents[0], setting, picture, as_json=as_json)
     if not is_kept:
         raise typer.Exit(FAILED)
+
+
+@content_app.command()
+def compare(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Haptic files, folders of haptic files, or names of built-in contents.",
+        ),
+    ],
+    table_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--table", metavar="TABLE", help="Table file, e.g. T.npz; default: the paper's plate."
+        ),
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y", help="Position of the finger in meters; default: off center."),
+    ] = None,
+    level: Annotated[
+        float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
+    ] = 20.0,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare how haptic files feel at the same position.
+
+    Prints one line per file: duration, kept level and sharpness as in `era content check`, highest
+    felt level, frequencies, and taps. The picture shows all files on the same scales, at most 8. To
+    compare loudness by ear, write each file with `era play --simulate`, whose full scale is fixed.
+    """
+    from model.files.output_paths import check_picture
+
+    contents = _content_files(files)
+    if picture is not None:
+        check_picture(picture)
+        if len(contents) > _MAX_COLUMNS:
+            raise InputError(
+                f"--output must be left out for more than {_MAX_COLUMNS} files, got {len(contents)}"
+            )
+    setting = _setting(table_file, at, [], level=level, channel=None, least=0.0)
+    if at is None:
+        setting = replace(setting, positions=setting.positions[1:2])
+    results: dict[str, tuple[Pattern, CheckedContent]] = {}
+    with progress_bar("files") as progress:
+        for number, file in enumerate(contents, start=1):
+            pattern, (checked,) = setting.check(file)
+            results[str(file)] = pattern, checked
+            progress(number, len(contents))
+    pictures = []
+    if picture is not None:
+        from era_haptics.lab.checks.content_figure import comparison_figure
+        from model.figures.style import save_figure
+
+        save_figure(comparison_figure(results), picture)
+        pictures = [str(picture)]
+    rows = [setting.plate_row, *_comparison_rows(results), *(f"wrote {name}" for name in pictures)]
+    compared = [{"file": name, **checked.as_json()} for name, (_, checked) in results.items()]
+    answer = {**setting.as_json(), "contents": compared, "files": pictures}
+    print_report(rows, answer, as_json=as_json)
+
+
+def _comparison_rows(
+    results: "Mapping[str, tuple[Pattern, CheckedContent]]",
+) -> Iterator[str]:
+    """Format a table with a row per file, and the position of the finger."""
+    yield "    s  level kept  sharpness kept  loudest felt  frequency     taps     file"
+    for name, (pattern, checked) in results.items():
+        tones = [part.frequency for part in checked.parts if part.frequency is not None]
+        felt_taps = len([part for part in checked.parts if part.stimulus.course is None])
+        taps = f"{felt_taps} of {max(len(pattern.transients), felt_taps)}"
+        yield (
+            f"{checked.duration:5.2f}  {percent_down(checked.kept_share):>10}  "
+            f"{percent_down(checked.sharpness_kept):>14}  {checked.given.max():6.1f} dB SL  "
+            f"{f'{_span(tones)} Hz':12}  {taps:7}  {name}"
+        )
+    x, y = checked.at
+    yield f"at {x:.3f},{y:.3f} m"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""Picture of checked content: level and frequency over time."""
+"""Pictures of checked content: level and frequency over time."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,8 +20,47 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
     """Draw level and frequency over time: the file in dashed gray, felt vibration in blue."""
     figure = Figure(figsize=(6.9, 4.0), layout="constrained")
     levels, tones = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    _draw_content(levels, tones, pattern, checked)
+    _set_scale(levels, tones, [checked])
+    levels.set_title(f"{checked.headline}, {_delay(checked)}", fontsize=10)
+    levels.legend(loc="best", fontsize=9)
+    tones.legend(loc="best", fontsize=8)
+    return figure
+
+
+def comparison_figure(contents: Mapping[str, tuple[Pattern, CheckedContent]]) -> Figure:
+    """Draw several contents by file, one column each, on the same scales."""
+    count = len(contents)
+    figure = Figure(figsize=(max(6.9, 3.4 * count), 4.4), layout="constrained")
+    axes = figure.subplots(2, count, sharex=True, sharey="row", height_ratios=(3, 2), squeeze=False)
+    for (name, (pattern, checked)), (levels, tones) in zip(contents.items(), axes.T, strict=True):
+        _draw_content(levels, tones, pattern, checked)
+        headline = checked.headline.replace(", ", "\n")
+        levels.set_title(
+            f"{Path(name).name}\n{headline}\n{_delay(checked)}", fontsize=9, loc="left"
+        )
+        levels.label_outer()
+        tones.label_outer()
+    _set_scale(axes[0, 0], axes[1, 0], [checked for _, checked in contents.values()])
+    axes[0, 0].legend(loc="best", fontsize=8)
+    return figure
+
+
+def _delay(checked: CheckedContent) -> str:
+    return f"felt {1000 * checked.delay:.0f} ms later"
+
+
+def _set_scale(levels: Axes, tones: Axes, contents: Sequence[CheckedContent]) -> None:
+    """Set the limits of axes to fit all contents."""
+    top = max([float(checked.expected.max()) for checked in contents])
+    levels.set_ylim(top - RANGE_DB, top + 2 * TOLERANCE_DB)
+    tones.margins(y=0.15)  # room for the legend between the curves
+    tones.set_xlim(0, max([checked.duration for checked in contents]))
+
+
+def _draw_content(levels: Axes, tones: Axes, pattern: Pattern, checked: CheckedContent) -> None:
+    """Draw level and frequency of a content over time."""
     times = np.asarray(checked.step * np.arange(len(checked.expected)), dtype=float)
-    top = float(checked.expected.max())
     low, high = checked.expected - TOLERANCE_DB, checked.expected + TOLERANCE_DB
     levels.fill_between(
         times, low, high, where=checked.is_counted, color=_REQUESTED_COLOR, alpha=0.3, lw=0
@@ -32,18 +74,10 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
         label="requested (band: ±3 dB)",
     )
     levels.plot(times - checked.delay, checked.given, color=_FELT_COLOR, lw=1.5, label="felt")
-    levels.set_ylim(top - RANGE_DB, top + 2 * TOLERANCE_DB)
     levels.set_ylabel("level / dB SL")
-    delay = f"felt {1000 * checked.delay:.0f} ms later"
-    levels.set_title(f"{checked.headline}, {delay}", fontsize=10)
-    levels.legend(loc="best", fontsize=9)
     _draw_frequencies(tones, pattern, checked, times)
-    tones.margins(y=0.15)  # room for the legend between the curves
-    tones.legend(loc="best", fontsize=8)
-    tones.set_xlim(0, checked.duration)
     tones.set_xlabel("time / s")
     tones.set_ylabel("frequency / Hz")
-    return figure
 
 
 def _draw_frequencies(

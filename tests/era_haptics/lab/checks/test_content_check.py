@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from era_haptics.lab.checks.touch_simulator import loaded_plate
 from era_haptics.lab.cli import app
 from kit.plates import smooth_rig
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
@@ -138,6 +140,7 @@ def report_of(content: str | Path, *options: str) -> dict[str, Any]:
 
 
 AT_PLACE = ("--at", "0.11,0.13")
+CHARGING = Path(__file__).parents[4] / "examples" / "charging.haptic"
 
 
 def test_command_reports_levels_over_time_and_draws_a_picture(
@@ -260,3 +263,32 @@ def test_unreadable_and_silent_files_fail_the_check_of_a_folder(
     assert silent["error"] == f"{folder / 'silent.ahap'}: must not be silent"
     assert tick["file"] == str(folder / "taps" / "tick.ahap")
     assert tick["kept_share"] >= 0.1
+
+
+def test_comparison_is_at_one_position_and_on_one_scale(tmp_path: Path, table_file: str) -> None:
+    """Each file as `check` finds it there; a folder counts as its files."""
+    (tmp_path / "folder").mkdir()
+    shutil.copy(CHARGING, tmp_path / "folder" / "own.haptic")
+    picture = tmp_path / "compared.png"
+    command = ["content", "compare", "success", str(tmp_path / "folder"), "--table", table_file]
+
+    result = CliRunner().invoke(app, [*command, *AT_PLACE, "-o", str(picture), "--json"])
+
+    report = json.loads(result.stdout)
+    assert report["files"] == [str(picture)]
+    assert picture.stat().st_size > 0
+    contents = report["contents"]
+    names = [content["file"] for content in contents]
+    assert names == ["success", str(tmp_path / "folder" / "own.haptic")]
+    for content, source in zip(contents, ("success", CHARGING), strict=True):
+        alone = report_of(source, "--table", table_file, *AT_PLACE)
+        assert content["at_m"] == [0.11, 0.13]
+        assert content["kept_share"] == alone["kept_share"]
+        assert content["level_db_sl"] == alone["level_db_sl"]
+
+    rows = CliRunner().invoke(app, command).stdout.splitlines()
+    shares = [row.split()[1] for row in rows[1:3]]
+    assert len(shares) == 2
+    assert rows[-1].startswith("at ")
+    many = CliRunner().invoke(app, [*command[:2], *["tick"] * 9, "-o", str(picture)])
+    assert isinstance(many.exception, InputError)

@@ -1,7 +1,7 @@
 """Promised and felt contrast on plates within the tolerances: docs/measured/promise.md.
 
     python -m benchmarks.promise [--cases 1,2] [--plates 60] [--first 0] [--workers 2]
-    python -m benchmarks.promise contents|clicks|everyday|weather|air [--sets N] [--plates N]
+    python -m benchmarks.promise contents|clicks|everyday|weather|air|levels [--sets N] [--plates N]
 
 Without a subcommand, it runs sessions through the complete signal chain, by case number. Each
 session has its own plate, ERAs, drives and fingertips, drawn within the uncertainty of the rig.
@@ -12,6 +12,7 @@ kept, both of default and of identified rigs.
 
 contents: by number of ERAs. clicks: without the wire. everyday: hands, force, objects and people;
 --only WORD ... selects rows. weather: after a change of weather. air: with air around the plate.
+levels: with gains that depend on the level.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
-from benchmarks.promise import air, clicks, contents, everyday, weather
+from benchmarks.promise import air, clicks, contents, everyday, levels, weather
 from benchmarks.promise.cases import CASES
 from benchmarks.promise.report import as_markdown, kept
 from benchmarks.promise.session import Outcome, outcome
@@ -35,7 +36,7 @@ def main() -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parts = ("sessions", "contents", "clicks", "everyday", "weather", "air")
+    parts = ("sessions", "contents", "clicks", "everyday", "weather", "air", "levels")
     parser.add_argument("part", nargs="?", choices=parts, default="sessions")
     parser.add_argument("--cases", help="numbers of sessions from 0; default: all")
     parser.add_argument("--first", type=int, default=0, help="seed of the first plate")
@@ -54,6 +55,8 @@ def main() -> None:
         weather.run(options.sets or 16, options.plates or 40)
     elif options.part == "air":
         air.run(options.sets or 24, options.plates or 40)
+    elif options.part == "levels":
+        levels.run(options.sets or 24, options.plates or 40)
     else:
         numbers = list(range(len(CASES)))
         if options.cases:

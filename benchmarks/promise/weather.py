@@ -7,7 +7,7 @@ moisture: its modulus is 3 % lower and its density 1.8 % higher. Answers ignore 
 it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from benchmarks.promise.cases import EXAMPLES, IDENTIFIED, LEVEL_DB_SL
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Placement, Stimulus
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
@@ -25,6 +25,7 @@ from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_o
 from model.table.fingertip_shapes import read_fingertips
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
+from model.vibration import Excitation
 
 MARGIN = 0.02  # m; of fingers from the edge
 
@@ -105,16 +106,23 @@ def contrasts_on(
     best: Answer,
     positions: Sequence[tuple[float, float]],
     plates: Plates,
+    gains: Callable[[Excitation], ComplexArray] | None = None,
 ) -> FloatArray:
-    """Contrast [dB] of each finger to the other's content on plates, (2, plates)."""
+    """Contrast [dB] of each finger to the other's content on plates, (2, plates).
+
+    gains: further gains (eras,) of the ERAs for an excitation.
+    """
     placed = Placement((positions[0],), (positions[1],))
     fingertips = read_fingertips(table, positions)
     powers = []
     for layer in best.layers:
-        rows, power = powers_on(table, placed, layer.excitation, plates)
+        of_layer = plates
+        if gains is not None:
+            of_layer = replace(plates, gain=plates.gain * gains(layer.excitation))
+        rows, power = powers_on(table, placed, layer.excitation, of_layer)
         thresholds = table.thresholds[rows, None, None].astype(float)
         total = (power / thresholds**2).sum(axis=0)
-        total += harmonics_on(table, placed, layer.excitation, plates)
+        total += harmonics_on(table, placed, layer.excitation, of_layer)
         powers.append(total.reshape(2, -1, total.shape[-1]))
     contrasts = []
     for finger in range(2):

@@ -64,7 +64,7 @@ class Timing:
         self._table, self._eras = table, table.eras
         self._shaper = Shaper(
             table.in_time,
-            gain_variance=table.uncertainty.gain_variance,
+            gain_variance=table.uncertainty.gain_variance(len(table.eras)),
             fingertips=partial(_few_points, table),
             magnets=table.magnets,
         )

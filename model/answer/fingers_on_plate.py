@@ -210,7 +210,7 @@ class FingerForms:
             threshold=table.thresholds.take(self.rows),
             wanted=10 ** (level_db_sl / 20),
         )
-        gain_variance = table.uncertainty.gain_variance
+        gain_variance = table.uncertainty.gain_variance(len(table.eras))
         if background is not None:
             rest_of_plate = background.copy()
             eras = np.arange(rest_of_plate.shape[1])

@@ -241,7 +241,7 @@ def _packed_rules(table: LocalizationTable) -> Rules:
     """Pack the rules for choosing tones, and the table's figures."""
     uncertainty = table.uncertainty
     groups = table.clocks.groups
-    gain_variance = uncertainty.gain_variance
+    gain_variance = uncertainty.gain_variance(len(table.eras))
     rules = Rules(
         kept=KEPT,
         missing=MISSING,

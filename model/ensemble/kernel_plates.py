@@ -68,7 +68,7 @@ class TouchedByKernel(TouchedPlate):
             p=point_count,
             fine=group_count * fine_count,
             others=plate.uncertainty.changes_modes,
-            gain_variance=plate.uncertainty.gain_variance,
+            gain_variance=plate.uncertainty.gain_variance(era_count),
             ridge=RIDGE,
         )
         groups.point(

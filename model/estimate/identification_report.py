@@ -129,6 +129,11 @@ def fit_rows(identification: Identification) -> list[str]:
             f"deviations from the rig's plate (at most {MAX_MODE_SHIFT:g})"
         )
     uncertainty = identification.rig.uncertainty
+    if identification.fitted.measurement.gain_by_level:
+        rows.append(
+            f"warning: gains change by {percent(uncertainty.level)} from full level to a tenth of "
+            "it, by the run at half level; promises count it as uncertainty.level"
+        )
     held_out = identification.held_out
     if held_out is None:
         return rows + quality_rows(uncertainty, "", None, "nothing is promised")

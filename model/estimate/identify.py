@@ -157,6 +157,7 @@ class Identification:
             damping=math.exp(max(errors["damping"], errors["loss"])),
             fingertip=original.fingertip,
             common_gain=math.hypot(original.common_gain, mean_gain_std),
+            level=max(original.level, self.fitted.measurement.gain_by_level),
             field=unexplained,
             place=errors["place"],
             harmonic=original.harmonic,

@@ -1,5 +1,6 @@
 """Measured responses of a plate: values at sensors, their errors, and checks of a measurement."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,12 +13,16 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate.forward import Sensor
+from model.rig.rig import LEVEL_PHASE
 
 LEAST_SENSORS = 3
 """Minimum number of sensors with a signal for fitting a plate."""
 
-NONLINEAR = 0.02
-"""Relative difference of responses at two levels beyond which a plate is not linear."""
+NONLINEAR = 0.05
+"""Relative difference of responses at full and half level beyond which a plate is not linear."""
+
+CHANGES_WITH_LEVEL = 0.01
+"""Relative difference of these responses beyond which gains depend on the level."""
 
 DRIFTED = 0.01
 """Relative difference of the first tone, played last again, beyond which a plate has changed."""
@@ -160,6 +165,14 @@ class Measurement:
         moves = zip(self.sensors, points.tolist(), strict=True)
         return replace(self, sensors=tuple(replace(sensor, x=x, y=y) for sensor, (x, y) in moves))
 
+    @property
+    def gain_by_level(self) -> float:
+        """Relative change of gains over a factor of ten in level; 0 within errors of readings."""
+        difference = max(map(_difference, self.half_level), default=0.0)
+        if difference <= CHANGES_WITH_LEVEL:
+            return 0.0
+        return difference / (math.log10(2) * math.hypot(1, LEVEL_PHASE))
+
     def check(self) -> None:
         """Raise InputError for a plate that was not linear or has changed during the
         measurement."""
@@ -169,11 +182,16 @@ class Measurement:
         )
 
 
+def _difference(repeat: Repeat) -> float:
+    """Return the relative difference of the responses to a tone measured twice."""
+    size = np.linalg.norm(repeat.values)
+    return float(np.linalg.norm(repeat.repeated - repeat.values) / size)
+
+
 def _check_repeats(repeats: Sequence[Repeat], limit: float, cause: str) -> None:
     """Raise InputError if responses to a tone that was measured twice differ too much."""
     for repeat in repeats:
-        size = np.linalg.norm(repeat.values)
-        difference = np.linalg.norm(repeat.repeated - repeat.values) / size
+        difference = _difference(repeat)
         if not difference <= limit:
             raise InputError(
                 f"response to ERA {repeat.era} at {repeat.frequency:g} Hz must stay within "

@@ -265,6 +265,10 @@ class UncertaintySection(Section):
     common_gain: Annotated[float, _within("common_gain")] = Uncertainty.common_gain
     """Common gain of all channels, relative; affects levels only."""
 
+    level: Annotated[float, _within("level")] = Uncertainty.level
+    """Change of the gain of each ERA from full level to a tenth of it, relative, by hysteresis or
+    creep; the phase changes by half as much in radians."""
+
     field: Annotated[float, _within("field")] = Uncertainty.field
     """Acceleration caused by each ERA at a finger, relative to its RMS over the plate, from causes
     that no other key describes.

@@ -236,7 +236,7 @@ class DenseScore:
             change = changed - nominal
             form += 0.5 * change.conj().T @ change
         powers = (np.abs(nominal) ** 2).sum(axis=0)
-        form += self.rig.uncertainty.gain_variance * np.diag(powers)
+        form += self.rig.uncertainty.gain_variance(len(powers)) * np.diag(powers)
         # The largest |h w|² / w^H R w is the one eigenvalue of R^-1 h* h^T.
         ratios = np.linalg.eigvals(np.linalg.solve(form, np.outer(target.conj(), target)))
         return float(10 * np.log10(np.abs(ratios).max()))

@@ -1,0 +1,77 @@
+"""Promises with gains that depend on the level: `python -m benchmarks.promise levels`.
+
+Two contents of 14 dB SL on plates that are solved exactly, drawn within the tolerances. Gains have
+been identified at full level; a tenth of it changes every ERA's gain by 10 % and its phase by 3°,
+as hysteresis does, or a half of this. Answers ignore it, or count it by `uncertainty.level`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.promise.cases import EXAMPLES, IDENTIFIED, LEVEL_DB_SL
+from benchmarks.promise.weather import contrasts_on
+from model.answer.plan import answer
+from model.answer.stimulus import Finger, Stimulus
+from model.arrays import ComplexArray
+from model.rig.rig_file import load_rig
+from model.study.contact_sets import random_contacts
+from model.study.exact_plates import draw_plates
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from model.vibration import Excitation
+
+MARGIN = 0.02  # m; of fingers from the edge
+PHASE_DEG = 30.0
+"""Change of the phase relative to that of the gain."""
+
+
+def run(sets: int, plates: int) -> None:
+    """Print a row for each rig and size of the change."""
+    print("| gain by level | ignored: promised, kept | counted: promised, kept |\n|---|---|---|")
+    for label, name, is_identified in (
+        ("4 ERAs default", "paper_plate", False),
+        ("4 ERAs identified", "paper_plate", True),
+        ("12 ERAs identified", "car_display", True),
+    ):
+        rig = load_rig(EXAMPLES / f"{name}.yaml")
+        if is_identified:
+            rig = replace(rig, uncertainty=IDENTIFIED)
+        ignoring = build_table(rig, drive_mode="phased", frequencies=np.arange(40.0, 321.0, 10.0))
+        for size in (0.05, 0.1):
+            counting = replace(ignoring, uncertainty=replace(rig.uncertainty, level=size))
+            cells = [
+                _promised_and_kept(table, size, sets, plates) for table in (ignoring, counting)
+            ]
+            print(f"| {100 * size:g} % a decade, {label} | {' | '.join(cells)} |", flush=True)
+
+
+def _promised_and_kept(table: LocalizationTable, size: float, sets: int, plates: int) -> str:
+    promises, kept = [], []
+    for number in range(sets):
+        rng = np.random.default_rng([number, 77])
+        positions = random_contacts(rng, 2, table.plate, margin=MARGIN)
+        fingers = [Finger(at, Stimulus(LEVEL_DB_SL)) for at in positions]
+        best = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
+        drawn = draw_plates(rng, table.uncertainty, count=plates, of=table, contact_count=2)
+
+        def gains(excitation: Excitation) -> ComplexArray:
+            return _gains_at(table, excitation, size)
+
+        promised = np.array([finger.promised_contrast_db for finger in best.fingers], dtype=float)
+        felt = contrasts_on(table, best, positions, drawn, gains)
+        promises.append(promised.min())
+        kept.append(felt >= promised[:, None])
+    return f"{np.median(promises):.1f} dB, {100 * np.mean(kept):.0f} %"
+
+
+def _gains_at(table: LocalizationTable, excitation: Excitation, size: float) -> ComplexArray:
+    """Return the gain (eras,) of each ERA at its level, relative to full level."""
+    gains = np.ones(len(table.eras), dtype=complex)
+    for number, era in enumerate(table.eras):
+        tone = excitation.get(era.name)
+        if tone is None or not tone.amplitude:
+            continue
+        decades = np.log10(tone.amplitude / era.full_level)
+        gains[number] = (1 + size * decades) * np.exp(-1j * np.radians(PHASE_DEG * size) * decades)
+    return gains

@@ -8,7 +8,9 @@ import socket
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +24,62 @@ from kit.plates import write_rig
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from processes.daemons import SESSION as DAEMONS_SESSION
-from processes.daemons import FarEndProcess, far_end_process, playing
+from processes.daemons import playing
 from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, control_socket, execute
 
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
+
+
+@dataclass
+class FarEndProcess:
+    """What was started: the URL by the amplifier's name, and its streams."""
+
+    urls: Mapping[str, str]
+    control: Path
+    process: asyncio.subprocess.Process
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+    async def ask(self, op: str, **request: Any) -> dict[str, Any]:
+        """Return the reply to a line of control, errors among them."""
+        self.writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
+        line = await asyncio.wait_for(self.reader.readline(), TIMEOUT)
+        reply: dict[str, Any] = json.loads(line)
+        return reply
+
+    async def end(self) -> tuple[int | None, str]:
+        """Terminate it; return its exit status and the rest of its standard output."""
+        self.process.terminate()
+        out, _ = await asyncio.wait_for(self.process.communicate(), TIMEOUT)
+        return self.process.returncode, out.decode()
+
+
+@asynccontextmanager
+async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProcess]:
+    """`era sim` of a rig file with these options; it ends with the context at the latest."""
+    with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
+        control = Path(folder) / "control"
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", "sim", str(rig), "--control", str(control), *options),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            cwd=example_rig_path().parent.parent,
+        )
+        try:
+            line = (await asyncio.wait_for(process.stdout.readline(), TIMEOUT)).decode()
+            name, _, url = line.strip().partition(": ")
+            reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
+            try:
+                yield FarEndProcess({name: url}, control, process, reader, writer)
+            finally:
+                writer.close()
+                with contextlib.suppress(ConnectionError):
+                    await writer.wait_closed()
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
 
 
 @pytest.mark.parametrize("is_interrupted", shortly([True, False], [True]))

@@ -11,10 +11,8 @@ import contextlib
 import json
 import logging
 import os
-import signal
 import struct
 import sys
-import tempfile
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -52,7 +50,7 @@ from kit.plates import small_table, write_rig
 from kit.wires import WIRES, FarSide, far_side
 from model.arrays import FloatArray
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import save_table
 from processes.installed import ERA
@@ -560,60 +558,6 @@ async def plays_on(
 def tell(subject: str, seconds: float) -> None:
     """Print a measured time; it is not asserted, for other programs on the machine lengthen it."""
     sys.stdout.write(f"\nmeasured: {subject}: {1e3 * seconds:.1f} ms\n")
-
-
-PROCESS_PATIENCE = 180  # s; for a loaded machine, not an expectation
-
-
-@dataclass
-class FarEndProcess:
-    """What was started: the URL by the amplifier's name, and its streams."""
-
-    urls: Mapping[str, str]
-    control: Path
-    process: asyncio.subprocess.Process
-    reader: asyncio.StreamReader
-    writer: asyncio.StreamWriter
-
-    async def ask(self, op: str, **request: Any) -> dict[str, Any]:
-        """One line of control and the answer to it, errors among them."""
-        self.writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
-        line = await asyncio.wait_for(self.reader.readline(), PROCESS_PATIENCE)
-        answer: dict[str, Any] = json.loads(line)
-        return answer
-
-    async def end(self, number: signal.Signals = signal.SIGTERM) -> tuple[int | None, str]:
-        """Tell it to end; its exit status and what it still said on standard output."""
-        self.process.send_signal(number)
-        out, _ = await asyncio.wait_for(self.process.communicate(), PROCESS_PATIENCE)
-        return self.process.returncode, out.decode()
-
-
-@asynccontextmanager
-async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProcess]:
-    """`era sim` of a rig file with these options; it ends with the context at the latest."""
-    with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
-        control = Path(folder) / "control"
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-m", "sim", str(rig), "--control", str(control), *options),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            cwd=example_rig_path().parent.parent,
-        )
-        try:
-            line = (await asyncio.wait_for(process.stdout.readline(), PROCESS_PATIENCE)).decode()
-            name, _, url = line.strip().partition(": ")
-            reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
-            try:
-                yield FarEndProcess({name: url}, control, process, reader, writer)
-            finally:
-                writer.close()
-                with contextlib.suppress(ConnectionError):
-                    await writer.wait_closed()
-        finally:
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
 
 
 SESSION = 9

@@ -34,13 +34,14 @@ from era_haptics.lab.checks.checked_effect import CheckedEffect
 from era_haptics.lab.checks.joint_touches import check_together
 from era_haptics.lab.checks.layout_check import check_layout
 from era_haptics.lab.cli import app
-from kit.fingers import WIRES, Pressed, playable
+from kit.fingers import playable
 from kit.fingers import table as paper_table
 from kit.plates import smooth_rig
 from model.arrays import Point
 from model.config.fields import Circle, Rectangle
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
+from tests.era_haptics.lab.checks.pressed_layout import WIRES, press
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -286,10 +287,10 @@ def test_effect_is_felt_as_promised_at_every_press(name: str, wire: str) -> None
     case = CASES[name]
     trigger = "on_move" if case.effect.is_for_motion else "on_press"
     region = Region("all", Circle(0.09, 0.10, 0.06), **{trigger: "it"})
-    chain = Pressed(smooth_rig(), table(), layout_of(region, case.effect), wire)
+    layout = layout_of(region, case.effect)
     count = PRESS_COUNTS.get(wire, 3)
 
-    presses = chain.press(*[case.path] * count, held=case.held)
+    presses = press(smooth_rig(), table(), layout, wire, case.path, count=count, held=case.held)
 
     assert [len(vibrations) for vibrations in presses] == [1] * count
     levels = []

@@ -24,7 +24,8 @@ def frame(
     kind: int, words: Sequence[int] = (), *, sequence: int, address: int = 1, version: int = VERSION
 ) -> bytes:
     """Return a frame with words as its payload; negative ones in two's complement."""
-    payload = struct.pack(f"<{len(words)}H", *(word % 65536 for word in words))
+    unsigned_words = [word % 65536 for word in words]
+    payload = struct.pack(f"<{len(words)}H", *unsigned_words)
     return raw_frame(kind, payload, sequence=sequence, address=address, version=version)
 
 
@@ -42,7 +43,9 @@ def tone(
 ) -> list[int]:
     """Return the words of a command without envelopes, in Hz, full levels and degrees."""
     head = channel << 4 | keep_phase << 3
-    return [head, round(frequency * 20), round(level * 10000), round(phase * 100)]
+    steps_of_frequency = round(frequency * 20)
+    steps_of_level = round(level * 10000)
+    return [head, steps_of_frequency, steps_of_level, round(phase * 100)]
 
 
 def layer(
@@ -54,8 +57,10 @@ def layer(
     renew: bool = False,
 ) -> list[int]:
     """Return the words of a layer of a set; ramp, valid_for [ms]."""
-    head = number << 7 | after << 6 | renew << 5 | len(commands)
-    return [head, ramp, valid_for, *(word for command in commands for word in command)]
+    words = [number << 7 | after << 6 | renew << 5 | len(commands), ramp, valid_for]
+    for command in commands:
+        words += command
+    return words
 
 
 def part(
@@ -63,5 +68,7 @@ def part(
     now: bool = False,
 ) -> list[int]:  # fmt: skip
     """Return the words of a Set with these words of its stream."""
-    head = [session, token, index << 8 | parts << 1 | now]
-    return [*head, *(word for each in layers for word in each)]
+    words = [session, token, index << 8 | parts << 1 | now]
+    for words_of_layer in layers:
+        words += words_of_layer
+    return words

@@ -27,17 +27,20 @@ class Magnets:
         reduced = reduce_plate(rig.plate, rig.mesh, places, frequency_max=rig.limits.frequency_max)
         shapes = reduced.at(places)
         M, C, K = modal_matrices(reduced, eras, loads=rig.masses, attachment_shapes=shapes)
-        r, count, inverse = len(K), len(eras), np.linalg.inv(M)
-        apart = np.hstack([shapes[:count], -np.eye(count)])
-        A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
-        B = np.vstack([np.zeros((r, count)), inverse @ apart.T])
-        self._out = np.hstack([apart, np.zeros((count, r))])
-        self._a, self._b, *_ = cont2discrete((A, B, self._out, np.zeros((count, count))), STEP)
+        size, count = len(K), len(eras)
+        inverse = np.linalg.inv(M)
+        gaps = np.hstack([shapes[:count], -np.eye(count)])  # between the ends of each exciter
+        velocities = np.hstack([np.zeros((size, size)), np.eye(size)])
+        accelerations = np.hstack([-inverse @ K, -inverse @ C])
+        A = np.vstack([velocities, accelerations])
+        B = np.vstack([np.zeros((size, count)), inverse @ gaps.T])
+        self._gaps = np.hstack([gaps, np.zeros((count, size))])
+        model = (A, B, self._gaps, np.zeros((count, count)))
+        self._a, self._b, *_ = cont2discrete(model, STEP)
         self._exciters = exciters_of(rig)
-        parts = [era.in_time for era in eras]
-        self._by_drive, self._by_rate = (
-            np.array([getattr(each, key) for each in parts]) for key in ("by_drive", "by_rate")
-        )
+        models = [era.in_time for era in eras]
+        self._by_drive = np.array([model.by_drive for model in models])
+        self._by_rate = np.array([model.by_rate for model in models])
 
     def moved(self, volts: ComplexArray) -> ComplexArray:
         """Motion of each coil in its magnet (n, exciters) [m] by voltages, phasors as these.
@@ -45,18 +48,21 @@ class Magnets:
         By Bl (u - L u' / R) / R. Their magnitude is what it is at the worst phase of all tones
         together.
         """
-        forces = volts * self._by_drive + np.gradient(volts, STEP, axis=0) * self._by_rate
-        state, found = np.zeros(len(self._a), dtype=complex), np.empty_like(forces)
+        rates = np.gradient(volts, STEP, axis=0)
+        forces = volts * self._by_drive + rates * self._by_rate
+        motion = np.empty_like(forces)
+        state = np.zeros(len(self._a), dtype=complex)
         for number, force in enumerate(forces):
-            found[number] = self._out @ state
+            motion[number] = self._gaps @ state
             state = self._a @ state + self._b @ force
-        return found
+        return motion
 
     def heat(self, volts: ComplexArray, moved: ComplexArray) -> FloatArray:
         """Power in each coil (n, exciters) [W], a mean over a cycle, back EMF included."""
         rates = np.gradient(moved, STEP, axis=0)
-        found = []
-        for number, one in enumerate(self._exciters):
-            current = volts[:, number] - one.force_factor * rates[:, number]
-            found.append(np.abs(current / one.loop_resistance) ** 2 * one.resistance / 2)
-        return np.stack(found, axis=1)
+        powers = []
+        for number, exciter in enumerate(self._exciters):
+            back_emf = exciter.force_factor * rates[:, number]
+            currents = (volts[:, number] - back_emf) / exciter.loop_resistance
+            powers.append(np.abs(currents) ** 2 * exciter.resistance / 2)
+        return np.stack(powers, axis=1)

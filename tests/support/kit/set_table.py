@@ -94,8 +94,8 @@ class SetTable(SetDrives):
     ) -> Answer:
         """The same for every target, 12 dB above others at 20 dB SL."""
         self.asked.append([*fingers])
-        quiet = [n for n, each in enumerate(fingers) if each.stimulus is None]
-        drive = self.shared if self.shared and quiet else self.excitation
+        has_quiet = any(finger.stimulus is None for finger in fingers)
+        drive = self.shared if self.shared and has_quiet else self.excitation
         if isinstance(drive, Exception):
             raise drive
         return set_answer(fingers, drive, drive_mode=drive_mode, limits=limits)
@@ -124,9 +124,10 @@ class SetTones(Tones):
     def excitations(self, content: int, *on: Any) -> list[Excitation]:
         """The drive at the content's gain."""
         gain = self.gains[content]
-        return [
-            {n: replace(tone, amplitude=gain * tone.amplitude) for n, tone in self.drive.items()}
-        ]
+        drive = {}
+        for name, tone in self.drive.items():
+            drive[name] = replace(tone, amplitude=gain * tone.amplitude)
+        return [drive]
 
 
 class SetAnswer(Answer):
@@ -135,7 +136,7 @@ class SetAnswer(Answer):
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
         """Along ramps of 15 ms."""
-        return tuple(replace(each, ramp=0.015) for each in Answer.layers.func(self))
+        return tuple(replace(layer, ramp=0.015) for layer in Answer.layers.func(self))
 
 
 def set_answer(
@@ -148,20 +149,24 @@ def set_answer(
     limits: Limits = NO_LIMITS,
 ) -> Answer:
     """Each finger with a stimulus feels a layer of its own, within the amplifiers' limits."""
-    felt = [n for n, each in enumerate(fingers) if each.stimulus is not None]
-    quiet = tuple(n for n in range(len(fingers)) if n not in felt)
-    contrast = contrast_db if len(fingers) > 1 else np.nan
-    foreign = level_db_sl - contrast_db if len(fingers) > 1 else np.nan
+    has_others = len(fingers) > 1
+    contrast = contrast_db if has_others else np.nan
+    foreign = level_db_sl - contrast_db if has_others else np.nan
     streams = []
-    for n in felt:
-        stimulus = fingers[n].stimulus
-        duration = None if stimulus is None else stimulus.duration
-        streams.append(Stream((n,), level_db_sl, ((0, 1),), fingers[n].priority, duration))
+    quiet = []
+    for number, finger in enumerate(fingers):
+        if finger.stimulus is None:
+            quiet.append(number)
+            continue
+        duration = finger.stimulus.duration
+        stream = Stream((number,), level_db_sl, ((0, 1),), finger.priority, duration)
+        streams.append(stream)
+    count = len(streams)
     tones = SetTones(
-        [0] * len(felt),
-        [[1.0]] * len(felt),
-        [1.0] * len(felt),
-        range(len(felt)),
+        [0] * count,
+        [[1.0]] * count,
+        [1.0] * count,
+        range(count),
         [(contrast,) * 3] * len(fingers),
         [(level_db_sl, level_db_sl)] * len(fingers),
         [[foreign]] * len(fingers),
@@ -170,39 +175,42 @@ def set_answer(
         is_apart=True,
         drive=drive,
     )
-    places = tuple(each.at for each in fingers)
-    contents = Contents(places, (), tuple(streams), quiet, drive_mode=drive_mode)
-    found: Answer = SetAnswer(
+    places = tuple(finger.at for finger in fingers)
+    contents = Contents(places, (), tuple(streams), tuple(quiet), drive_mode=drive_mode)
+    frequencies = np.array([110.0])
+    result: Answer = SetAnswer(
         tuple(fingers),
         contents,
         tones,
         (),
         (),
         (),
-        np.array([110.0]),
+        frequencies,
         np.ones((1, 0)),
         np.ones(1, np.float32),
     )
     table: Any = SetDrives()
-    factor = limits.factor_within(found.layers, table)
-    return scaled(found, 20 * np.log10(factor)) if factor < 1 else found
+    factor = limits.factor_within(result.layers, table)
+    return scaled(result, 20 * np.log10(factor)) if factor < 1 else result
 
 
-def _answer(table: Any, fingers: Sequence[Finger], **others: Any) -> Answer:
-    asked: Answer = getattr(table, "answer", partial(answer, table))(fingers, **others)
-    return asked
+def _answer(table: Any, fingers: Sequence[Finger], **options: Any) -> Answer:
+    answer_of_table = getattr(table, "answer", partial(answer, table))
+    result: Answer = answer_of_table(fingers, **options)
+    return result
 
 
-def _query(table: Any, placed: Placement, *level: float, **others: Any) -> Answer:
+def _query(table: Any, placed: Placement, *level: float, **options: Any) -> Answer:
     if isinstance(table, SetTable):
         if isinstance(table.excitation, Exception):
             raise table.excitation
         return set_answer(together(placed, Stimulus()), table.excitation)
-    return query(table, placed, *level, **others)
+    return query(table, placed, *level, **options)
 
 
 def _prepare(table: Any, drive_mode: str | None) -> None:
-    getattr(table, "prepare", partial(prepare_answers, table))(drive_mode)
+    prepare = getattr(table, "prepare", partial(prepare_answers, table))
+    prepare(drive_mode)
 
 
 joint_answers.answer = _answer
@@ -227,11 +235,11 @@ class SetTiming:
 
 
 def only(
-    table: LocalizationTable, placed: Placement, level_db_sl: float = 20.0, **more: Any
+    table: LocalizationTable, placed: Placement, level_db_sl: float = 20.0, **options: Any
 ) -> tuple[Layer, Sensation]:
     """What is played for fingers, and what the first of them feels."""
-    found = query(table, placed, level_db_sl, **more)
-    return found.layers[0], found.fingers[0]
+    result = query(table, placed, level_db_sl, **options)
+    return result.layers[0], result.fingers[0]
 
 
 def wants(
@@ -243,25 +251,30 @@ def wants(
     may_share: bool = False,
     name: str | None = None,
     modulation_hz: float | None = None,
-    **more: Any,
+    **options: Any,
 ) -> Finger:
     """A finger that is to feel a stimulus of its own."""
     stimulus = Stimulus(level_db_sl, band_hz, modulation_hz=modulation_hz, name=name)
     sharing = ANY if may_share else BY_NAME
-    return Finger(at, stimulus, priority=priority, sharing=sharing, **more)
+    return Finger(at, stimulus, priority=priority, sharing=sharing, **options)
 
 
 def phased(
     table: LocalizationTable,
     fingers: Sequence[Finger],
     quiet: Sequence[Finger | Point] = (),
-    **more: Any,
+    *,
+    drive_mode: str = "phased",
+    **options: Any,
 ) -> Answer:
     """The answer in mode `phased`, whatever the table's own is."""
-    return answer(table, fingers, quiet=quiet, **{"drive_mode": "phased"} | more)
+    return answer(table, fingers, quiet=quiet, drive_mode=drive_mode, **options)
 
 
-def drives(found: Answer) -> list[Excitation]:
+def drives(result: Answer) -> list[Excitation]:
     """What plays for each finger, empty where nothing does."""
-    numbers = [each.layer for each in found.fingers]
-    return [{} if n is None else found.layers[n].excitation for n in numbers]
+    excitations: list[Excitation] = []
+    for finger in result.fingers:
+        excitation = {} if finger.layer is None else result.layers[finger.layer].excitation
+        excitations.append(excitation)
+    return excitations

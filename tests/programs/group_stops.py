@@ -47,7 +47,6 @@ from sim.faults import FaultKind, FaultWindow, Toward
 
 _CHANNELS, _LAYERS = 2, 4
 _PASSING = 50e-6, 350e-6  # s; through driver and adapter, that sets may be read back at any time
-_LOST, _DOUBLED = 0.03, 0.03  # share of frames
 _FAILURES = (CommandRefused, LinkError, Preempted)
 
 
@@ -110,16 +109,10 @@ class RandomGroup(Chain):
             far_end.recover()
         self.host_rules.disturb(-1)
 
-    async def live(self, steps: int, *, lossy_steps: int = 0) -> None:
-        """Open and arm the group, take so many steps, the first lossy, and disarm."""
+    async def live(self, steps: int) -> None:
+        """Open and arm the group, take so many steps, and disarm."""
         await self.open()
-        for step in range(steps):
-            if step == 0 and lossy_steps:
-                lost = FaultWindow(fault="drop", share=_LOST)
-                self.disturb(lost, FaultWindow(fault="duplicate", share=_DOUBLED))
-            elif step == lossy_steps and lossy_steps:
-                self.recover()
-                await asyncio.sleep(0.6)
+        for _ in range(steps):
             with contextlib.suppress(*_FAILURES):
                 await self._step()
             await asyncio.sleep(self.rng.choice((0.0, 0.001, 0.01, 0.04, 0.2)))
@@ -237,7 +230,7 @@ class Tally:
     """Outcomes of stops by wire, and what was found wrong."""
 
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
-    found: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
     def total(self, what: str) -> int:
         """The sum over all wires."""
@@ -246,9 +239,9 @@ class Tally:
 
 @dataclass
 class Stopping(RandomGroup):
-    """A chain whose group is stopped; found: what was wrong."""
+    """A chain whose group is stopped; problems: what was wrong."""
 
-    found: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
     _granted: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -309,7 +302,10 @@ class Stopping(RandomGroup):
         return ""
 
     def _check(self, names: Iterable[str], what: str) -> None:
-        self.found += [f"{what} {loud}" for name in names if (loud := self._loud(name))]
+        for name in names:
+            loud = self._loud(name)
+            if loud:
+                self.problems.append(f"{what} {loud}")
 
     async def compare(self, outcomes: Mapping[str, StopOutcome], scene: str) -> None:
         """Compare the outcomes of a stop with the amplifiers, now and until all is silent."""
@@ -318,15 +314,15 @@ class Stopping(RandomGroup):
         self._granted.clear()
         await asyncio.sleep(_LATE)
         self._check(certain, f"{scene}: confirmed silent, but afterwards")
-        self.found += [
-            f"{scene}: confirmed silent, then {each}"
-            for each in self._granted
-            if each.split()[0] in certain
-        ]
+        for grant in self._granted:
+            name, *_ = grant.split()
+            if name in certain:
+                self.problems.append(f"{scene}: confirmed silent, then {grant}")
         for name, outcome in outcomes.items():
             if not outcome.is_confirmed:
-                left = outcome.may_play_until + _MAX_DELAY - asyncio.get_running_loop().time()
-                await asyncio.sleep(min(max(0.0, left), 3 * LONGEST))
+                now = asyncio.get_running_loop().time()
+                remaining = outcome.may_play_until + _MAX_DELAY - now
+                await asyncio.sleep(min(max(0.0, remaining), 3 * LONGEST))
                 self._check([name], f"{scene}: {outcome}, but afterwards")
 
     def end(self) -> None:
@@ -364,13 +360,13 @@ async def _stop(chain: Stopping, wire: str, scene: str, tally: Tally) -> None:
         return
     await asyncio.wait([stopping], timeout=LONGEST)  # cancelled, it would still go on
     if not stopping.done():
-        chain.found.append(f"{scene}: stop has not ended within {LONGEST:g} s")
+        chain.problems.append(f"{scene}: stop has not ended within {LONGEST:g} s")
     elif stopping.exception() is not None:  # no success
         tally.counts[wire, "raised"] += 1
     else:
         outcomes = stopping.result()
         if outcomes.keys() != chain.group.amplifiers.keys():
-            chain.found.append(f"{scene}: outcomes of {sorted(outcomes)} only")
+            chain.problems.append(f"{scene}: outcomes of {sorted(outcomes)} only")
         for outcome in outcomes.values():
             tally.counts[wire, "confirmed" if outcome.is_confirmed else "may play"] += 1
         await chain.compare(outcomes, scene)
@@ -402,7 +398,7 @@ async def _stop_with_exception(chain: Stopping, wire: str, tally: Tally, seed: i
         chain.lose_some()
     with _exception_at(at) as planted:
         await _stop(chain, wire, f"{scene}, exception at line {at} {planted}", tally)
-    chain.found = [f"{one} {planted}" for one in chain.found]
+    chain.problems = [f"{problem} {planted}" for problem in chain.problems]
 
 
 async def _stop_by_command(chain: Stopping, wire: str, tally: Tally, seed: int) -> None:
@@ -436,28 +432,28 @@ def _exception_at(number: int) -> Iterator[list[str]]:
 
     Yields the place, once it is reached. Lines on which a far end depends do not count.
     """
-    left = number
+    lines_left = number
     place: list[str] = []
 
     def watch(frame: types.FrameType, event: str, _: object) -> Any:
-        nonlocal left
+        nonlocal lines_left
         if not frame.f_code.co_filename.startswith(_WATCHED) or _is_of_far_end(frame):
             return None
         if event == "line":
-            left -= 1
-            if left <= 0:
-                sys.settrace(before)
+            lines_left -= 1
+            if lines_left <= 0:
+                sys.settrace(former_trace)
                 code = frame.f_code
                 place.append(f"{Path(code.co_filename).name}:{frame.f_lineno} {code.co_name}")
                 raise Planted
         return watch
 
-    before = sys.gettrace()
+    former_trace = sys.gettrace()
     sys.settrace(watch)
     try:
         yield place
     finally:
-        sys.settrace(before)
+        sys.settrace(former_trace)
 
 
 def _is_of_far_end(frame: types.FrameType | None) -> bool:
@@ -484,10 +480,10 @@ def play(programme: str, seed: int, tally: Tally) -> None:
             await chain.open()
             await PROGRAMMES[programme](chain, wire, tally, seed)
             chain.end()
-        return chain.found
+        return chain.problems
 
     try:
-        found = run_virtual(run(), rng=rng)
+        problems = run_virtual(run(), rng=rng)
     except Stuck as problem:
-        found = [str(problem)]
-    tally.found += [f"seed {seed} on {wire}: {one}" for one in found]
+        problems = [str(problem)]
+    tally.problems += [f"seed {seed} on {wire}: {problem}" for problem in problems]

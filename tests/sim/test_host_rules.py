@@ -35,8 +35,11 @@ KINDS = {
 LINES = ("shared", "each its own")
 
 
-def live(kind: str, lines: str, seed: int, *, lossy_steps: int = 0) -> None:
-    """Drive two amplifiers through a random day on a kind of wire, and judge it."""
+@pytest.mark.parametrize("seed", shortly(range(12), [1]))
+@pytest.mark.parametrize("lines", shortly(LINES, ["shared"]))
+@pytest.mark.parametrize("kind", shortly(KINDS, ["can", "rtu"]))
+def test_rules_are_kept_in_random_days(kind: str, lines: str, seed: int) -> None:
+    """Layers, stops, disarms, faults, and watchdogs that expire, heard at the amplifiers' end."""
     rng = random.Random(seed)
     wire = KINDS[kind]
     alone = {name: replace(wire, line=name, shared=False) for name in ("a", "b")}
@@ -44,20 +47,12 @@ def live(kind: str, lines: str, seed: int, *, lossy_steps: int = 0) -> None:
 
     async def run() -> None:
         async with RandomGroup.of(wires, rng) as chain:
-            await chain.live(40, lossy_steps=lossy_steps)
+            await chain.live(40)
             await chain.close()
             chain.judge()
             assert chain.host_rules.requests > 100
 
     run_virtual(run(), rng=rng)
-
-
-@pytest.mark.parametrize("seed", shortly(range(12), [1]))
-@pytest.mark.parametrize("lines", shortly(LINES, ["shared"]))
-@pytest.mark.parametrize("kind", shortly(KINDS, ["can", "rtu"]))
-def test_rules_are_kept_in_random_days(kind: str, lines: str, seed: int) -> None:
-    """Layers, stops, disarms, faults, and watchdogs that expire, heard at the amplifiers' end."""
-    live(kind, lines, seed)
 
 
 ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}

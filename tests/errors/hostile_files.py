@@ -5,14 +5,12 @@ a reader's valid file, and reports the outcome, the memory above that before, an
 processor. A variant that waits for ever is reported as such.
 """
 
-import bz2
 import contextlib
 import ctypes
 import gc
 import gzip
 import io
 import json
-import lzma
 import os
 import pickle
 import random
@@ -202,29 +200,23 @@ _NOISE = random.Random(1).randbytes(1 << 16)
 
 CONTENTS: Mapping[str, Content] = {
     "empty": lambda _: b"",
-    "blanks": lambda _: b" \n" * (1 << 16),
     "zeros": lambda _: bytes(1 << 16),
     "noise": lambda _: _NOISE,
     "noise behind a valid start": lambda sample: sample[:20] + _NOISE,
     "cut in half": lambda sample: sample[: len(sample) // 2],
-    "cut to 3 bytes": lambda sample: sample[:3],
     "zero bytes inside": _in_text(lambda sample: sample[:50] + bytes(9) + sample[50:]),
     "no UTF-8": lambda _: b'{"a": "\xfc\xff\xfe"}\n1,\xe9,3\n',
     "UTF-16": lambda sample: sample.decode("latin-1").encode("utf-16"),
     "UTF-32": lambda sample: sample.decode("latin-1").encode("utf-32"),
-    "half a pair of UTF-16": lambda _: b"\xff\xfe\x00\xd8a\x00\n\x00",
     "surrogates as UTF-8": _in_text(lambda sample: b"a\xed\xa0\x80: 1\n" + sample),
     "surrogates in JSON": lambda _: b'{"a\\ud800": "\\udfff"}',
     "control characters": lambda _: b"\x1b[2J\x1b]0;title\x07: \x1b[31m\n",
     "a long line": lambda _: b"a" * LONG,
-    "a long line of numbers": lambda _: b"1 " * (LONG // 2),
     "a long key": lambda _: b"a" * 500_000 + b": 1\n",
     "many empty lines": lambda _: b"\n\r\n" * (LONG // 3),
-    "many short lines": lambda _: b"1,2\n" * (LONG // 4),
     "many commas": lambda _: b"," * LONG,
     "digits": lambda _: _DIGITS,
     "digits in JSON": lambda _: b'{"a": %s}' % _DIGITS,
-    "digits in a list": lambda _: b"[%s, 1]" % _DIGITS,
     "digits of a dataset": lambda _: b"    -1\n%s\n 1\n    -1\n" % _DIGITS,
     "digits of a binary dataset": lambda _: (
         b"    -1\n    58b 1 2 11 %s 0 0\n 1\n    -1\n" % _DIGITS
@@ -242,20 +234,14 @@ CONTENTS: Mapping[str, Content] = {
     "keys given twice": lambda _: b'{"a": 1, "a": 2}\n',
     "NaN in JSON": lambda _: b'{"a": NaN, "b": -Infinity, "c": 1e999}',
     "NaN for every number": _numbers(b"nan"),
-    "infinity for every number": _numbers(b"inf"),
     "1e999 for every number": _numbers(b"1e999"),
     "digits for every number": _numbers(b"9" * 5000),
     "NaN in every array": _values(float("nan")),
-    "infinity in every array": _values(float("inf")),
     "gzip": gzip.compress,
-    "bzip2": bz2.compress,
-    "xz": lzma.compress,
     "zip": _packed,
-    "zip without members": lambda _: b"PK\x05\x06" + bytes(18),
     "zip whose end lies": lambda _: b"PK\x05\x06" + b"\xff" * 18,
     "zip of 60 000 members": _always(_many_members),
     "archive that is deflated": _in_npz(partial(_archive, compression=zipfile.ZIP_DEFLATED)),
-    "archive of bzip2": _in_npz(partial(_archive, compression=zipfile.ZIP_BZIP2)),
     "archive that is encrypted": _in_npz(partial(_patched, flags=1)),
     "archive of an unknown method": _in_npz(partial(_patched, method=99)),
     "archive with a broken stream": _in_npz(_broken_deflate),
@@ -269,12 +255,10 @@ CONTENTS: Mapping[str, Content] = {
     "array of a terabyte": _of_shape(b"(137438953472,)"),
     "array of many empty rows": _of_shape(b"(1099511627776, 0)", b""),
     "array of negative shape": _of_shape(b"(-1, -4)"),
-    "array of a true shape": _of_shape(b"(True, 4)"),
     "array of a shape of digits": _of_shape(b"(%s,)" % (b"9" * 5000)),
     "array without a tuple": _of_shape(b"4"),
     "array of brackets": _with_first(lambda _: _npy(b"(((")),
     "array of deep brackets": _with_first(lambda _: _npy(b"(" * 9000)),
-    "array of another header": _with_first(lambda _: _npy(b"{'descr': (1,)}")),
     "array of records": _with_first(
         lambda _: _npy(
             b"{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1,)}", bytes(8)
@@ -290,7 +274,6 @@ CONTENTS: Mapping[str, Content] = {
     "sound of 65535 channels": lambda _: _wav(bytes(4 * 65535), channels=65535, bits=8),
     "sound without channels": lambda _: _wav(bytes(999), channels=0),
     "sound of NaN": lambda _: _wav(np.full(9999, np.nan, "<f4").tobytes(), code=3, bits=32),
-    "sound of infinity": lambda _: _wav(np.full(9999, np.inf, "<f4").tobytes(), code=3, bits=32),
     "sound of 4 GHz": lambda _: _wav(bytes(999), rate=4_000_000_000),
 }
 """By what a variant is, its content, made of that of a valid file; an equal one is left out."""

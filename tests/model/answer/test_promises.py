@@ -324,27 +324,6 @@ def test_hand_with_three_contents_silences_no_other_person(order: tuple[int, ...
         assert served.promised_worst_db == pytest.approx(single.promised_worst_db, abs=1.0)
 
 
-def test_fingers_9_cm_apart_do_not_share() -> None:
-    """Contents with other names that do not fit are held back, the newest first."""
-    places = [(x, y) for y in (0.03, 0.12) for x in (0.03, 0.15, 0.27)]
-    fingers = [Finger(at, Stimulus(14, name=str(number))) for number, at in enumerate(places)]
-
-    served = phased(example_table(), fingers)
-
-    verdicts = [sensation.verdict for sensation in served.fingers]
-    assert "shared" not in verdicts
-    assert verdicts[0] != "held back"
-    earlier: list[Finger] = []
-    for finger, verdict in zip(fingers, verdicts, strict=True):
-        if verdict != "held back":
-            earlier.append(finger)
-            continue
-        trial = [*earlier, finger]
-        quiet = [Finger(absent.at) for absent in fingers if absent not in trial]
-        contrast = phased(example_table(), trial, quiet, min_contrast_db=-99).promised_worst_db
-        assert contrast < MIN_CONTRAST_DB, finger
-
-
 # Sets of thresholds
 
 PROBE, PRESSING = "vibrotactile-probe", "pressing-fingertip"

@@ -343,26 +343,6 @@ def test_limit_is_not_lowered_for_another_content() -> None:
     assert joint.fingers[0].promised_level_db_sl > level_alone - 3.0
 
 
-def test_two_targets_share_a_vibration_of_their_level() -> None:
-    """The weaker one is promised the level.
-
-    No phase is absolute: that of the strongest ERA is zero, the others are relative to it.
-    """
-    ((*targets, quiet),) = contact_sets(1, fingers=3, seed=9)
-    placed = Placement(tuple(targets), (quiet,))
-
-    answer = query(smooth_table(), placed, 15.0, drive_mode="phased")
-
-    first, second, _ = answer.fingers
-    promised = min(first.promised_level_db_sl, second.promised_level_db_sl)
-    assert promised == pytest.approx(15.0, abs=0.1)
-    assert second.verdict == "shared"
-    (layer,) = answer.layers
-    tones = sorted(layer.excitation.values(), key=lambda tone: tone.amplitude)
-    assert tones[-1].phase == 0.0
-    assert 0.0 not in {tone.phase for tone in tones[:-1]}
-
-
 @pytest.mark.parametrize("mode", ["switched", "phased"])
 def test_band_limits_the_frequencies_of_an_answer(mode: str) -> None:
     """From 150 to 250 Hz no tone lies outside; the ends of a band are in it."""

@@ -28,12 +28,10 @@ from model.finger import Grid
 from model.reduction import element_modes
 from model.reduction.attachment_points import place_slopes
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.reduced_plate import reduce_plate
-from model.reduction.supported_plate import modal_matrices
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.plate_mesh import SpectralMesh
-from model.structure.attachments import PointLoad, footprints_of
+from model.structure.attachments import PointLoad
 from model.structure.laminate_bending import equivalent_plate
 from model.structure.material import Material
 from model.structure.plate import LOSS_FREQUENCY, AirGap, Laminate, LaminateLayer, Plate
@@ -392,25 +390,3 @@ def test_deviations_change_the_receptance_of_their_modes_alone(
         shape = shapes[:, mode]
         expected += change[:, None, None] * np.outer(shape, shape)
     np.testing.assert_allclose(receptances, expected, atol=1e-12 * np.abs(expected).max())
-
-
-def test_plate_in_time_has_its_deviations(deviating_rig: Rig) -> None:
-    """Steady vibration of the viscous plate in time is that of the hysteretic one within 1 %."""
-    plate, mesh, eras = deviating_rig.plate, deviating_rig.mesh, deviating_rig.eras
-    era = eras[0]
-    reduced = reduce_plate(plate, mesh, footprints_of(eras))
-    mass, damping, stiffness = modal_matrices(reduced, eras)
-    (at_era,) = reduced.at(footprints_of(eras[:1]))
-    at_points = reduced.at(POINTS)
-
-    response = []
-    for omega in 2 * np.pi * FREQUENCIES:
-        force = (era.stiffness + 1j * omega * era.damping) * era.stroke
-        dynamic = stiffness + 1j * omega * damping - omega**2 * mass
-        coordinates = np.linalg.solve(dynamic, at_era * force)
-        accelerations = -(omega**2) * at_points @ coordinates
-        response.append(accelerations)
-
-    free = solve_free_plate(plate, mesh, frequency_max=500.0)
-    expected = free.acceleration(eras, FREQUENCIES, POINTS)[:, :1]
-    assert_within(np.array(response)[:, None], expected, 0.01)

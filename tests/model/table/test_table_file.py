@@ -4,16 +4,14 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from kit.plates import make_paper_rig, small_problem, small_table
+from kit.plates import make_paper_rig, small_table
 from model import caching
-from model.commands.options import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
 from model.finger import Grid
@@ -51,25 +49,6 @@ def test_load_table_reads_what_was_written(path: Path) -> None:
         values, written = getattr(table, name), getattr(expected, name)
         np.testing.assert_array_equal(values, written, err_msg=name)
     assert list(path.parent.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("frequencies", [[60.0, 110.0, 250.0], [62.5, 65.0, 67.5]])
-def test_error_for_another_plate_has_the_command_of_the_table(
-    tmp_path: Path, frequencies: list[float]
-) -> None:
-    """With the table's frequencies, cells and drive mode."""
-    problem = replace(small_problem(), frequencies=np.array(frequencies))
-    path = tmp_path / "t.npz"
-    save_table(solve_table(problem, drive_mode="phased"), path)
-
-    with pytest.raises(InputError) as error:
-        load_table(path, rig=replace(problem.rig, fingertip=None))
-
-    option = dict(pairwise(str(error.value).split()))
-    assert option["--mode"] == "phased"
-    assert option["--grid"] == "4x3"
-    assert option["-o"] == str(path)
-    np.testing.assert_allclose(parse_frequencies(option["--frequencies"]), frequencies)
 
 
 # Damaged and forged files

@@ -1,29 +1,26 @@
 """Magnets and exciters in time: by hand for rigid plates, by SciPy and in the frequency domain."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import StateSpace, lsim
+from scipy.signal import lsim
 
 from cases import shortly
 from kit.magnets import STEP, Magnets
 from kit.plates import exciter_rig, make_paper_rig
 from model.answer.envelope import swings_of_pulse
-from model.arrays import FloatArray
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate, reduce_plate
-from model.reduction.supported_plate import modal_matrices, supported_modes
+from model.reduction.reduced_plate import reduce_free_plate
+from model.reduction.supported_plate import supported_modes
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
 from model.structure.attachments import footprints_of
-from model.structure.exciter import Exciter
-from model.structure.fingertips import Fingertip, FingertipLoad, fingertip_loads
+from model.structure.fingertips import Fingertip, FingertipLoad
 from model.structure.statics import rigid_body_frequencies
 from model.table.table_file import build_table
 from model.transients.base_motion import shaped
@@ -34,14 +31,12 @@ from model.transients.excursions import (
     excursions_of,
     magnets_of,
     motions_along,
-    relative_motions,
 )
 from model.transients.knots import (
     steady_states,
 )
 from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.transients.reach import reach_of
-from model.transients.sampled_response import from_rest
 from model.transients.shaping import Shaper, Transients
 from model.vibration import Tone
 
@@ -55,32 +50,6 @@ def stiff_board(rig: Rig, **material: float) -> Rig:
 
 
 # Excursions of magnets
-
-
-def test_magnets_move_more_on_a_board_as_light_as_they_are() -> None:
-    """Four magnets of 109 g on 411 g of heaving board: two masses on a spring, driven between.
-
-    The resonance is sqrt((M + m) / M) = 1.4 times as high as on a board that is held.
-    """
-    rig = exciter_rig("type: DAEX25FHE-4, coil_mass: 0, power: 1 W, stiffness: 3189, damping: 0.76")
-    corners = [(0.0, 0.0), (0.3, 0.0), (0.3, 0.23), (0.0, 0.23)]
-    eras = tuple(replace(era, x=x, y=y) for era, (x, y) in zip(rig.eras, corners, strict=True))
-    rig = replace(stiff_board(rig), eras=eras, masses=())
-    frequencies = np.array([30.0, 39.0, 55.0, 90.0])
-
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
-    excursions = np.abs(relative_motions(rig, free, frequencies).sum(axis=1))
-
-    assert isinstance(eras[0], Exciter)
-    omega = 2 * math.pi * frequencies
-    impedance = 4.4 + 1j * omega * 1e-4
-    force = 3.63 * eras[0].voltage / impedance
-    board_mass = rig.plate.mass / 4
-    reduced_mass = 0.10929 * board_mass / (0.10929 + board_mass)
-    damping = 0.76 + 3.63**2 / impedance
-    dynamic_stiffness = 3189 + 1j * omega * damping - omega**2 * reduced_mass
-    expected = np.abs(force / dynamic_stiffness)
-    np.testing.assert_allclose(excursions, np.tile(expected[:, None], 4), rtol=0.01)
 
 
 @pytest.mark.long
@@ -219,81 +188,6 @@ def test_repeated_pulses_are_bounded_at_the_worst_repetition_rate() -> None:
 
 
 # The plate in time
-
-RATE = 5000.0
-COUNT = 400
-FINER = 64
-
-
-def chirp(times: FloatArray) -> FloatArray:
-    """A burst from 60 to 400 Hz that comes and goes smoothly within 70 ms."""
-    window = np.exp(-(((times - 0.04) / 0.009) ** 2))
-    return np.asarray(window * np.sin(2 * np.pi * (60 * times + 2100 * times**2)))
-
-
-def base_motions(oversampling: int) -> FloatArray:
-    """Motions in strokes of two ERAs, the second inverted and 3 ms later."""
-    times = np.arange(COUNT * oversampling) / (RATE * oversampling)
-    return np.array([0.8 * chirp(times), -0.5 * chirp(times - 0.003)])
-
-
-def accelerations_by_scipy(
-    rig: Rig,
-    reduced: ReducedPlate,
-    tips: Sequence[FingertipLoad],
-    points: FloatArray,
-    driven: list[int],
-) -> FloatArray:
-    """Accelerations at points, integrated by SciPy from finely sampled motions of two ERAs."""
-    mass, damping, stiffness = modal_matrices(reduced, rig.eras, contacts=tips)
-    order = len(mass)
-    inverse = np.linalg.inv(mass)
-    zeros = np.zeros((order, order))
-    identity = np.eye(order)
-    stiffness_rows = -inverse @ stiffness
-    damping_rows = -inverse @ damping
-    A = np.block([[zeros, identity], [stiffness_rows, damping_rows]])
-    with_finger = ((0, 0), (0, 1))  # the fingertip's own coordinate comes last
-    at_all_eras = np.pad(reduced.at(footprints_of(rig.eras)), with_finger)
-    at_eras = at_all_eras[driven].T
-    springs = [rig.eras[number].stiffness for number in driven]
-    dampers = [rig.eras[number].damping for number in driven]
-    forces = np.hstack([at_eras * springs, at_eras * dampers])
-    B = np.vstack([np.zeros((order, 4)), inverse @ forces])
-    at_points = np.pad(reduced.at(points), with_finger)
-    system = StateSpace(A, B, at_points @ A[order:], at_points @ B[order:])
-    times = np.arange(COUNT * FINER) / (RATE * FINER)
-    motions = base_motions(FINER).T * rig.eras[0].stroke
-    velocities = np.gradient(motions, times, axis=0)
-    _, accelerations, _ = lsim(system, np.hstack([motions, velocities]), times)
-    return np.asarray(accelerations[::FINER])
-
-
-def test_sampled_motions_are_followed_as_scipy_integrates() -> None:
-    """Two ERAs and a finger on the plate: within 1e-4 of the peak.
-
-    SciPy gets motion and velocity of the bases 64 times as finely, joined by straight lines. Twice
-    as many samples give the same to 1e-7, since the signals are band-limited.
-    """
-    rig = make_paper_rig(12, 9)
-    tips = fingertip_loads(Fingertip(), [(0.1, 0.08)])
-    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras, (), tips))
-    plate = plate_in_time(reduced, rig.eras, contacts=tips)
-    points = np.array([[0.1, 0.08], [0.25, 0.2]])
-    driven = [0, 3]
-
-    def response(oversampling: int) -> FloatArray:
-        signals = np.zeros((4, oversampling * COUNT))
-        signals[driven] = base_motions(oversampling)
-        rate, shapes = oversampling * RATE, reduced.at(points)
-        samples = from_rest(plate, signals, shapes, sample_rate=rate, factors=np.ones(4))
-        return samples[::oversampling]
-
-    samples, finer_samples = response(1), response(2)
-
-    expected = accelerations_by_scipy(rig, reduced, tips, points, driven)
-    np.testing.assert_allclose(samples, finer_samples, atol=1e-7 * np.abs(samples).max())
-    np.testing.assert_allclose(samples, expected, atol=1e-4 * np.abs(expected).max())
 
 
 POINTS = np.array([[0.05, 0.05], [0.15, 0.12], [0.28, 0.2]])

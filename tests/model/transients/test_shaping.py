@@ -27,7 +27,7 @@ from model.transients.base_motion import (
     ramped_onset,
     shaped,
 )
-from model.transients.knots import ONSET_KNOTS, bounded_minimum, hat_accelerations, steady_states
+from model.transients.knots import ONSET_KNOTS, bounded_minimum, steady_states
 from model.transients.plate_in_time import PlateInTime, plate_in_time
 from model.transients.shaping import SAMPLE_RATE, Shaper, Transients
 from model.vibration import Excitation, Tone
@@ -249,25 +249,6 @@ STEP = 0.005
 def few_modes() -> tuple[Rig, PlateInTime]:
     """Rig and plate with modes for 100 Hz only, so that a stepping solver is quick."""
     return make_plate_in_time(frequency_max=100.0)
-
-
-def test_hat_response_equals_time_stepping(few_modes: tuple[Rig, PlateInTime]) -> None:
-    """Closed form, back on its carrier, follows Runge-Kutta through rise, fall and ringing."""
-    rig, plate = few_modes
-    omega = 2 * math.pi * 90.0
-    samples = 4
-    hat = shaped_base(rig.eras[1].stroke, 90.0, start=0.0, step=STEP, knots=(0, 1, 0))
-    bases = [STILL.motion, hat.motion, STILL.motion, STILL.motion]
-    breaks = STEP * np.array([0, 1, 2, 6])
-
-    hats = hat_accelerations(plate, omega, step=STEP, steps=6, samples=samples)
-    times = STEP * (np.arange(len(hats)) + 0.5) / samples
-    carrier = np.exp(1j * omega * times)
-    response = (hats[:, 1] * carrier[:, None]).imag
-
-    expected = stepped_acceleration(plate, bases, times, breaks=breaks)
-    tolerance = 1e-5 * np.abs(expected).max()
-    np.testing.assert_allclose(response, expected, atol=tolerance)
 
 
 def test_acceleration_equals_time_stepping(few_modes: tuple[Rig, PlateInTime]) -> None:

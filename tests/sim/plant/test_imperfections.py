@@ -83,27 +83,6 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
     assert unaffected == pytest.approx(correct, rel=1e-9)
 
 
-@pytest.mark.parametrize("latency", [0.0, 0.05])
-def test_imperfections_latency_keeps_the_order_of_commands(
-    two_amplifiers: Rig, latency: float
-) -> None:
-    """Two sets within the latency both play, each as long as intended."""
-    imperfections = Imperfections(delays={"left": latency})
-    bench = Bench(two_amplifiers, now=0.0, imperfections=imperfections)
-    bench.place_fingers({"a": FINGER}, now=0.0)
-    arm_bench(bench, 2.0, now=0.0, name="left")
-    play(bench, AmplifierTone(0, 110.0, 0.5), now=0.1, name="left", token=1)
-    play(bench, AmplifierTone(0, 170.0, 0.5), now=0.12, name="left", token=2)
-    bench.advance(0.4)
-
-    frequencies = []
-    for start, end in ((0.09, 0.0999), (0.1001, 0.1199), (0.1201, 0.15)):
-        finger = bench.felt(start + latency, end + latency)["a"]
-        frequencies.append(finger.frequencies)
-
-    assert frequencies == [(), (110.0,), (170.0,)]
-
-
 def drawn_parameters(imperfections: Imperfections, rig: Rig) -> dict[str, float]:
     """Return all parameters that are drawn, logarithms of those that are factors."""
     plate = imperfections.plate

@@ -3,7 +3,6 @@
 Fingers come and go; exciters play the answers of a table.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,11 +22,11 @@ from model.fem import Mesh, PlateMatrices, assemble
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
-from model.structure.fingertips import Fingertip, FingertipLoad
+from model.structure.fingertips import FingertipLoad
 from model.structure.plate import Plate
 from model.structure.sources import Era
 from model.table.table_file import build_table
-from model.transients.base_motion import Term, raised_cosine
+from model.transients.base_motion import Term
 from sim.plant.excited_plate import play
 from sim.plant.plant import Plant
 
@@ -72,47 +71,6 @@ def plant_of(rig: Rig) -> Plant:
     footprints = footprints_of(rig.eras, rig.masses)
     reduced = reduce_plate(rig.plate, rig.mesh, footprints, frequency_max=500.0)
     return Plant(reduced, rig.eras, loads=rig.masses)
-
-
-FINGER = {"a": FingertipLoad(0.11, 0.09, Fingertip())}
-
-
-def playing_plant(rig: Rig) -> Plant:
-    """Return a plate whose four exciters start to play 95 Hz."""
-    plant = plant_of(rig)
-    for number in range(4):
-        amplitude = 1.0 + 0.5j * number
-        terms = raised_cosine(0.0, 0.02, 2 * math.pi * 95.0, 0j, amplitude)
-        plant.set_input(number, terms)
-    return plant
-
-
-def settled_amplitude(plant: Plant) -> complex:
-    """Return the amplitude of 95 Hz at a point from 1.3 to 1.5 s."""
-    plant.skip(1.3)
-    shapes = plant.reduced.at(np.array([[0.11, 0.09]]))
-    times, samples = plant.advance(1.5, sample_rate=10_000.0, shapes=shapes)
-    return complex(lock_in(times, samples, 95.0)[0])
-
-
-def test_finger_that_arrives_while_exciters_play() -> None:
-    """The magnets move on; the plate settles as if the finger had been there from the start."""
-    rig = exciter_rig("type: DAEX25FHE-4")
-    plant = playing_plant(rig)
-    plant.skip(0.0317)
-    earlier_magnets = plant.state[0][-4:]
-
-    plant.set_contacts(FINGER)
-
-    displacements, velocities = plant.state
-    assert displacements[-5:-1] == pytest.approx(earlier_magnets)
-    assert np.abs(earlier_magnets).min() > 1e-6
-    phalanx = [displacements[-1], velocities[-1]]
-    assert phalanx == pytest.approx([0, 0], abs=1e-12)
-    from_start = playing_plant(rig)
-    from_start.set_contacts(FINGER)
-    expected = settled_amplitude(from_start)
-    assert settled_amplitude(plant) == pytest.approx(expected, rel=1e-3)
 
 
 def test_nominal_answer_of_exciters_is_felt_on_the_unreduced_plate() -> None:

@@ -88,21 +88,6 @@ def test_felt_level_is_that_of_the_plate_in_time() -> None:
         assert level == pytest.approx(level_in_time(felt, time), abs=0.3), time
 
 
-def test_continuous_events_and_transients_have_their_levels() -> None:
-    """20 dB SL for a second, except the plate's rise; then a transient of 15 dB SL alone."""
-    envelope = ((0.0, 1.0), (1.0, 1.0), (1.0, 0.0))
-    pattern = Pattern(1.5, envelope, ((0.0, 0.5),), (Transient(1.3, 0.5, 0.5),))
-
-    check = check_content(pattern, table(), 20.0, at=PLACE)
-
-    middle = check.given[round(0.2 / check.step) : round(0.9 / check.step)]
-    end = check.given[round(1.3 / check.step) :]
-    assert np.median(middle) == pytest.approx(20.0, abs=1.0)
-    assert max(end) == pytest.approx(15.0, abs=2.0)
-    assert check.kept_share > 0.9
-    assert check.delay <= 0.01
-
-
 def test_content_with_a_quiet_finger_is_smoothed_and_promised() -> None:
     """Its envelope starts and ends at rest; the lowest promise of its parts counts."""
     check = check_content(SWELL, table(), 20.0, at=PLACE, quiet=[QUIET])

@@ -60,6 +60,7 @@ from model.study.contrast_maps import ContrastMap as ContrastMap
 from model.table.table import LocalizationTable as LocalizationTable
 from model.table.table_file import load_table as load_table
 from model.table.table_file import save_table as save_table
+from model.vibration import FrequencySweep as FrequencySweep
 from model.vibration import PlateMap as PlateMap
 from model.vibration import Tone as Tone
 from registry.limits import GuardLimits as GuardLimits

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from era_haptics.drive import (
+    MAX_LEVEL,
     Fingers,
     Played,
     Positions,
@@ -37,7 +38,7 @@ from model.structure.attachments import footprints_of
 from model.structure.fingertips import check_loads
 from model.study.contrast_maps import ContrastMap
 from model.table.table import LocalizationTable, default_drive_frequencies
-from model.vibration import PlateMap, Tone, plate_map
+from model.vibration import FrequencySweep, PlateMap, Tone, plate_map
 from sim.plant.excited_plate import play, play_signals
 from sim.plant.fingers import FingerRecord
 from sim.plant.imperfections import Imperfections, draw_of_ensemble
@@ -131,6 +132,41 @@ class SolvedPlate:
             loads=[*self._real.masses, *self._drawn.resting(self.rig, resting)],
         )
         return accelerations * self._drawn.factors(self.rig)[:, None]
+
+    def sweep(
+        self,
+        weights: Mapping[str, complex],
+        points: Positions,
+        frequencies: Sequence[float] | FloatArray | None = None,
+        *,
+        fingers: Fingers = (),
+    ) -> FrequencySweep:
+        """Compute the acceleration [m/s²] at points while ERAs play together, at each frequency.
+
+        - weights: of ERAs by name; a magnitude of 1 is full stroke. Other ERAs are silent.
+        - points, frequencies, fingers: as for `responses`.
+
+        Raises InputError for unknown ERAs, for magnitudes above 1, and as `responses`.
+
+        Example:
+            >>> swept = plate.sweep({"SW": 1, "NE": -1}, (0.08, 0.06), range(60, 321, 10))
+            >>> f"strongest at {swept.frequencies[abs(swept.acceleration[:, 0]).argmax()]:.0f} Hz"
+            'strongest at 320 Hz'
+        """
+        for name, weight in weights.items():
+            self.rig.era(name)
+            if not abs(weight) <= MAX_LEVEL:
+                raise InputError(f"weight of {name} must be at most 1 (full stroke), got {weight}")
+        hertz = as_frequencies(
+            default_drive_frequencies(self.rig.limits) if frequencies is None else frequencies
+        )
+        responses = self.responses(points, hertz, fingers=fingers)
+        row = np.array([complex(weights.get(era.name, 0.0)) for era in self.rig.eras])
+        return FrequencySweep(
+            frequencies=hertz,
+            points=np.reshape(as_points(points, what="points"), (-1, 2)),
+            acceleration=np.asarray(np.einsum("e,fep->fp", row, responses)),
+        )
 
     def map(self, drive: Played, *, raster: tuple[int, int] | None = None) -> PlateMap:
         """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.

@@ -160,6 +160,33 @@ class PlateMap:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class FrequencySweep:
+    """Acceleration at points over frequency."""
+
+    frequencies: FloatArray
+    """Frequencies (f,) [Hz]."""
+    points: FloatArray
+    """Points (p, 2) [m]."""
+    acceleration: ComplexArray
+    """Complex peak acceleration (f, p) [m/s²]: a(t) = Im[acceleration exp(i omega t)]."""
+
+    def to_frame(self) -> Any:
+        """Return frequency, point, peak and phase as a pandas DataFrame, a row for each pair."""
+        count = len(self.points)
+        x, y = np.tile(self.points, (len(self.frequencies), 1)).T
+        acceleration = self.acceleration.ravel()
+        return as_frame(
+            {
+                "frequency_hz": np.repeat(self.frequencies, count),
+                "x_m": x,
+                "y_m": y,
+                "peak_m_s2": np.abs(acceleration),
+                "phase_deg": np.degrees(np.angle(acceleration)),
+            }
+        )
+
+
 def plate_map(
     rig: Rig,
     *excitations: Excitation,

@@ -62,7 +62,8 @@ def as_frame(columns: Columns) -> Any:
         pandas = import_module("pandas")
     except ModuleNotFoundError as error:
         raise InputError(
-            "to_frame needs pandas, which is not installed; install it with  pip install pandas"
+            "to_frame needs pandas, which is not installed; install the extra `frames`, or run  "
+            "pip install pandas"
         ) from error
     return pandas.DataFrame(dict(columns))
 

@@ -57,6 +57,28 @@ def test_responses_weighted_by_a_drive_are_its_map(seed: int | None) -> None:
     np.testing.assert_allclose(weighted, expected, atol=1e-6 * np.abs(expected).max())
 
 
+def test_sweep_is_the_map_of_its_drive_at_each_frequency() -> None:
+    """As a table, too; unknown ERAs and more than full stroke are rejected."""
+    rig = make_paper_rig(12, 9)
+    plate = era.SolvedPlate(rig)
+    points = [(0.0, 0.0), (rig.plate.length, rig.plate.width)]
+
+    swept = plate.sweep({"SW": 1, "NE": 0.5j}, points, [110, 250])
+
+    for number, hertz in enumerate((110, 250)):
+        field = plate.map({"SW": hertz, "NE": era.Drive(hertz, 0.5, 90)}, raster=(2, 2)).field[0]
+        corners = [field[0, 0], field[1, 1]]
+        np.testing.assert_allclose(swept.acceleration[number], corners, rtol=1e-6)
+    frame = swept.to_frame()
+    assert frame.frequency_hz.tolist() == [110, 110, 250, 250]
+    assert frame.x_m.tolist() == [0.0, rig.plate.length] * 2
+    np.testing.assert_allclose(frame.peak_m_s2, np.abs(swept.acceleration).ravel())
+    with pytest.raises(era.InputError, match="unknown ERA"):
+        plate.sweep({"XX": 1}, points)
+    with pytest.raises(era.InputError, match="weight of SW must be at most 1"):
+        plate.sweep({"SW": 1.1}, points)
+
+
 # Playback
 
 

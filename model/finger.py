@@ -100,6 +100,15 @@ FIVE_POINTS = _rings((0.0, 1, 1 / 2), (1.0, 4, 1 / 2))
 FINE_POINTS = _rings((0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6))
 """Twenty-one points (twelve on the rim), exact to degree 7: for figures."""
 
+ENDS = (1, 2, 3, 4)
+"""Indices of the points of `FIVE_POINTS` at the ends of the disc: +x, +y, -x, -y."""
+
+FINE_ENDS = (9, 12, 15, 18)
+"""Indices of the same points in `FINE_POINTS`."""
+
+FINE_DIAGONAL = (2, 4, 6, 8)
+"""Indices of the points of `FINE_POINTS` at (+-1/2, +-1/2), by quadrant."""
+
 FIVE_AND_FINE = DiscRule(
     points=np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
     weights=np.stack([np.pad(FIVE_POINTS.weights, (0, 21)), np.pad(FINE_POINTS.weights, (5, 0))]),

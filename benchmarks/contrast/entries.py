@@ -63,7 +63,7 @@ class _Case:
         """Fields on plates at rows (f,) of the table's frequencies, (d, f, points, eras)."""
         strokes = np.diag([complex(era.full_level) for era in self.table.eras])
         bases = np.repeat(strokes[None], len(rows), axis=0)
-        at = touched(self.table, self.placed)
+        at = touched(self.table, self.placed, plates)
         return accelerations_on(self.table, *at, self.table.attached, rows, bases, plates).swapaxes(
             2, 3
         )

@@ -18,7 +18,7 @@ from model.answer.envelope import DriveEnvelope
 from model.answer.plan import query
 from model.answer.ringing import RingingUnderFingers
 from model.answer.stimulus import Placement
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -76,12 +76,25 @@ def given(
     relative to its level at the loudest other finger.
     """
     found = np.empty((len(answers), plates))
+    touches = _touches(rig, plates, max(len(each.contents.places) for each in answers), seed)
     for number, drawn in enumerate(_drawn_plates(table, rig, plates, seed)):
         for row, each in enumerate(answers):
-            own, *others = (_felt_on(*drawn, each, layer) for layer in range(len(each.layers)))
+            places = [
+                (x + dx, y + dy)
+                for (x, y), (dx, dy) in zip(each.contents.places, touches[number], strict=False)
+            ]
+            layers = range(len(each.layers))
+            own, *others = (_felt_on(*drawn, each, places, layer) for layer in layers)
             heard = sum(power[0] for _, power in others) if others else own[1][1:].max()
             found[row, number] = 10 * math.log10(own[0] / heard)
     return found
+
+
+def _touches(rig: Rig, plates: int, fingers: int, seed: int) -> list[list[list[float]]]:
+    """Draw the displacement (plates, fingers, 2) [m] of fingers from their reported positions."""
+    rng = np.random.default_rng([seed, 1])
+    drawn = rig.uncertainty.touch_offset * rng.standard_normal((plates, fingers, 2))
+    return drawn.tolist()
 
 
 def _drawn_plates(
@@ -154,21 +167,22 @@ def _felt_on(
     gains: ComplexArray,
     harmonic: ComplexArray,
     answer: Answer,
+    places: Sequence[Point],
     number: int,
 ) -> tuple[float, FloatArray]:
     """Return the power to threshold of a layer at its first finger, and at all loudest points (k,).
 
-    It is evaluated over the duration, at the strongest moments of a course, or in the steady state
-    of a continuous layer.
+    places: where the fingers of the answer touch the plate [m]. It is evaluated over the duration,
+    at the strongest moments of a course, or in the steady state of a continuous layer.
     """
-    contents, power = answer.contents, 0.0
+    contents, power = replace(answer.contents, places=tuple(places)), 0.0
     steady = RingingUnderFingers(
-        table, contents.places, contents.loads, DriveEnvelope(np.ones(2), 1e-3, 1, share=0.0)
+        table, places, contents.loads, DriveEnvelope(np.ones(2), 1e-3, 1, share=0.0)
     )
     over = RingingUnderFingers.of_streams(table, contents)[number] or steady
-    target, heard = contents.streams[number].targets[0], np.zeros(len(contents.places))
-    points = fingertip_points(*contents.places[target], table.plate)
-    weights = fingertip_weights(*contents.places[target], table.plate)
+    target, heard = contents.streams[number].targets[0], np.zeros(len(places))
+    points = fingertip_points(*places[target], table.plate)
+    weights = fingertip_weights(*places[target], table.plate)
     by_name = dict(zip((era.name for era in table.eras), gains.tolist(), strict=True))
     for excitation in answer.layers[number].excitations:
         tones = {
@@ -176,7 +190,7 @@ def _felt_on(
             for name, tone in excitation.items()
         }
         hertz, bases = base_amplitudes(tones, table.eras)
-        frequencies, amplitudes = table.amplitudes(tones, points, contacts=contents.places)
+        frequencies, amplitudes = table.amplitudes(tones, points, contacts=places)
         thresholds = table.thresholds[table.rows_of(frequencies), None]
         level = float(np.linalg.norm(amplitudes / thresholds, axis=0) @ weights)
         played = over.over(zip(hertz.tolist(), bases, strict=True))

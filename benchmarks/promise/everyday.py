@@ -25,7 +25,7 @@ from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray
 from model.finger import FINGERTIP_RADIUS, decibels
 from model.structure.fingertips import Fingertip, FingertipLoad, object_load
-from model.study.exact_plates import Plates, accelerations_on, draw_plates
+from model.study.exact_plates import Plates, accelerations_on, discs_on, draw_plates
 from model.table.fingertip_shapes import read_fingertips
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, base_amplitudes
@@ -47,8 +47,10 @@ class Situation:
     for the corner farthest from both; size, reported [mm]: longer axis of the hand, and the value
     that the touch source reports. surplus: number of fingers that feel nothing. mass [kg]: of an
     object. is_counted: whether the answer counts the hand, the surplus fingers or the object. force
-    [N]: of all fingers; fingertip: uncertainty that the answer counts, None for the rig's. person:
-    the difference of the thresholds.
+    [N]: of all fingers; fingertip: uncertainty that the answer counts, None for the rig's. off [m]:
+    distance of both fingers from their reported positions, in any direction, None for a distance
+    drawn within the rig's uncertainty; touch_position: as fingertip. person: the difference of the
+    thresholds.
     """
 
     name: str
@@ -61,6 +63,8 @@ class Situation:
     is_counted: bool = True
     force: float = LIGHT_FORCE
     fingertip: float | None = None
+    off: float | None = None
+    touch_position: float | None = None
     person: str = ""
 
 
@@ -81,6 +85,13 @@ def situations() -> Iterator[Situation]:
     ):
         yield replace(counted, name=f"{counted.name}, not counted", is_counted=False)
         yield replace(counted, name=f"{counted.name}, counted")
+    yield Situation("touches exactly as reported", off=0.0)
+    for off in (0.002, 0.004):
+        stated = f"touches {1e3 * off:g} mm off"
+        yield Situation(f"{stated}, taken for exact", off=off, touch_position=0.0)
+        yield Situation(
+            f"{stated}, `touch_position: {1e3 * off:g} mm`", off=off, touch_position=off
+        )
     yield Situation("force of 1 N", force=1.0)
     yield Situation("force of 2 N", force=2.0)
     yield Situation("force of 2 N, fingertip: 0.9", force=2.0, fingertip=0.9)
@@ -131,8 +142,10 @@ class _Scene:
     def _known(self) -> dict[str, float]:
         """Return the uncertainty that the answer counts in place of the rig's."""
         known = {}
-        if self._situation.fingertip is not None:
-            known["fingertip"] = self._situation.fingertip
+        for key in ("fingertip", "touch_position"):
+            stated = getattr(self._situation, key)
+            if stated is not None:
+                known[key] = stated
         if self._situation.mass and self._situation.is_counted:
             known["foreign_mass"] = self._situation.mass
         return known
@@ -228,6 +241,10 @@ class _Scene:
         )
         if self._situation.mass:
             plates.load[:, 2:] = 1.0
+        if self._situation.off is not None:
+            angles = self._rng.uniform(0, 2 * np.pi, (count, 2))
+            directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+            plates.touches[:, :2] = self._situation.off * directions
         return plates
 
     def _thresholds_of_persons(self, best: Answer, count: int) -> FloatArray:
@@ -251,7 +268,7 @@ class _Scene:
             (self._situation.force / LIGHT_FORCE) ** (2 / 3)
         )
         loads = [*(FingertipLoad(*at, tip) for at in self._fingers), *self._loads]
-        discs = read_fingertips(table, [(each.x, each.y) for each in loads]).fine.astype(float)
+        discs = discs_on(table, [(each.x, each.y) for each in loads], plates)
         hertz, bases = base_amplitudes(excitation, table.eras)
         rows = table.rows_of(hertz)
         drives = bases[:, None]

@@ -184,6 +184,13 @@ class _Session:
         drawn = random_contacts(self._rng, count, size, margin=margin, beside=apart_from)
         return [(float(x), float(y)) for x, y in drawn]
 
+    def _draw_touches(self) -> dict[int, Point]:
+        """Draw the displacement [m] of each finger from its reported position."""
+        rng = np.random.default_rng([self._drawn.seed, 15])
+        offset = self._rig.uncertainty.touch_offset
+        touches = offset * rng.standard_normal((len(self._positions), 2))
+        return {id: (dx, dy) for id, (dx, dy) in enumerate(touches.tolist())}
+
     def _are_on_plate(self, positions: Sequence[Point]) -> bool:
         """Whether all fingertips are on the plate, which may have a cut-out."""
         around = FINGERTIP_RADIUS * np.array(DIRECTIONS)
@@ -213,6 +220,7 @@ class _Session:
             imperfections=self._drawn,
         ) as chain:
             chain.must_be_felt = False
+            chain.off = self._draw_touches()
             log = Log(self._rig, self._drawn, threads.now())
             log.watch(chain.far.bench)
             self._want_contents()
@@ -299,8 +307,7 @@ class _Session:
 
     def _place(self, chain: Any, loads: Mapping[str, float]) -> None:
         """Place the fingers on the plate without a report of the panel."""
-        fingers = {str(id): position for id, position in chain.at.items()}
-        chain.far.bench.place_fingers(fingers, now=threads.now(), loads=loads)
+        chain.far.bench.place_fingers(chain.touched_at(), now=threads.now(), loads=loads)
 
     def _other_band(self, steady: _Steady) -> Band:
         """Return a band without the frequency of the content that changes."""

@@ -155,6 +155,20 @@ class DaemonConfig:
     socket: Path
     log_file: Path | None
 
+    @property
+    def touch_position(self) -> float:
+        """RMS distance [m] of fingers from the positions that the worst touch source reports.
+
+        The value in the rig file, if there is one; otherwise from the calibration of the sources.
+        """
+        default = self.rig.uncertainty.touch_position
+        document = self.rig.document
+        stated = document.data.get("uncertainty") if document else None
+        if isinstance(stated, dict) and "touch_position" in stated:
+            return default
+        distances = [source.calibration.touch_position(default) for source in self.touch]
+        return max(distances, default=default)
+
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return a copy whose layouts are rendered for the frequencies of a table [Hz]."""
         layouts = {}

@@ -378,7 +378,7 @@ def run_until_stopped(
 def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:
     """Load the table named in the file; raises ConfigError with the line that names it."""
     try:
-        return load_table(file, rig=config.rig)
+        return _with_touch_position(load_table(file, rig=config.rig), config)
     except InputError as error:
         document = read_document(config.source)
         problem = document.problem(("table",), str(error))
@@ -392,4 +392,13 @@ def prepared_table(config: DaemonConfig) -> LocalizationTable:
         return _load_table(config, config.table)
     table, file = cached_table(config.rig)
     _logger.info("localization table: %s", file or "not cached")
-    return table
+    return _with_touch_position(table, config)
+
+
+def _with_touch_position(table: LocalizationTable, config: DaemonConfig) -> LocalizationTable:
+    """Return the table with the uncertainty of touches from the calibration of their sources."""
+    uncertainty = replace(table.uncertainty, touch_position=config.touch_position)
+    if uncertainty == table.uncertainty:
+        return table
+    _logger.info("touch: positions within %.1f mm (RMS)", 1e3 * uncertainty.touch_position)
+    return replace(table, uncertainty=uncertainty)

@@ -20,6 +20,8 @@ _Point: TypeAlias = tuple[float, float]
 MAX_RESIDUAL = 0.005
 """Largest residual [m] of a correctly touched point: less than a fingertip's radius of 6.5 mm."""
 
+_FITTED_POINTS = 3  # points that an affine map fits exactly
+
 _MIN_DETERMINANT = 1e-3  # below it, the points on the plate are almost collinear
 
 _ROTATIONS: dict[int, tuple[_Row, _Row]] = {
@@ -35,6 +37,8 @@ class TouchCalibration:
     """Map from sensor to plate: the rows for x' and y'."""
 
     matrix: tuple[_Row, _Row] = _ROTATIONS[0]
+    residuals: tuple[float, ...] = ()
+    """Distance [m] of each touched point from its mapped position; empty without points."""
 
     def apply(self, touch: Touch) -> Touch:
         """Map a touch to coordinates 0..1 across the plate; NaN stays NaN."""
@@ -46,6 +50,17 @@ class TouchCalibration:
             width, height = size
             size = math.hypot(a * width, b * height), math.hypot(d * width, e * height)
         return replace(touch, x=x, y=y, size=size)
+
+    def touch_position(self, default: float) -> float:
+        """Return the RMS distance [m] of touches from their mapped positions.
+
+        From the residuals. The three points that any map fits count with a default [m] instead, so
+        three points, or none, leave the default.
+        """
+        if not self.residuals:
+            return default
+        squares = sum(residual**2 for residual in self.residuals)
+        return math.sqrt((squares + _FITTED_POINTS * default**2) / len(self.residuals))
 
 
 ALIGNED = TouchCalibration()
@@ -100,4 +115,4 @@ def fit_touch_calibration(
             "and whether the panel is curved"
         )
     (a, d), (b, e), (c, f) = solution.tolist()
-    return TouchCalibration(((a, b, c), (d, e, f)))
+    return TouchCalibration(((a, b, c), (d, e, f)), tuple(residuals.tolist()))

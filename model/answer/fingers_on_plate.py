@@ -110,6 +110,7 @@ class FingersOnPlate:
             tips.few_weights,
             self.table.search_error_power,
             tips.fine if with_fine else None,
+            tips.touch_steps,
         )
         return FingerForms(self, rows, contacts)
 
@@ -134,6 +135,7 @@ class FingersOnPlate:
             self.tips.fine_weights,
             self.table.error_power,
             self.table.thresholds,
+            touch_steps=self.tips.touch_steps,
             with_powers=with_powers,
         )
 

@@ -251,6 +251,7 @@ def _packed_rules(table: LocalizationTable) -> Rules:
         is_deep=gain_variance < MAX_VARIANCE_FINE,
         others=uncertainty.changes_modes,
         gain_variance=gain_variance,
+        touch_offset=uncertainty.touch_offset,
         ridge=RIDGE,
         margin=LEVEL_MARGIN,
         highest=phased_weights.NEARLY_HIGHEST,

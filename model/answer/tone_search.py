@@ -169,9 +169,11 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     others = contents.others(0)
     points = fingers.tips.few
     weights = fingers.tips.few_weights
+    touch_steps = fingers.tips.touch_steps
     if len(others) > MAX_FINGERS_BY_POINT:
         points = touched.centers[:, None]
         weights = np.ones_like(weights[:, :1])
+        touch_steps = None
     shares = np.zeros_like(weights)
     shares[others] = weights[others] / np.float32(len(others))
     contacts = touched.forms(
@@ -179,6 +181,7 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
         points.reshape(1, -1, points.shape[2]),
         shares.reshape(1, -1),
         table.search_error_power,
+        touch_steps=touch_steps,
     )
     fields = contacts.fields.reshape(len(rows), *points.shape[:2], -1)
     mean = (weights[target] @ fields[:, target])[None]

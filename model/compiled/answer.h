@@ -15,7 +15,8 @@ typedef struct {
     int max_by_point, pruning_step; /* largest number of other fingers whose points count individually; step of the
                                      * draws that prune combinations */
     int rim_count, is_deep, others; /* number of rim points; whether nulls can be deep; whether plate thickness varies */
-    float gain_variance, ridge, margin, highest;
+    float gain_variance, touch_offset, ridge, margin, highest; /* touch_offset: standard deviation of a finger's position
+                                                                * along x and y [m] */
     float reached;
     float judged, promised;        /* percentiles of the drawn plates, for candidates and for promises */
     phases phases;
@@ -59,6 +60,7 @@ typedef struct {
     int *row, *band;            /* (rows) row numbers in the table; (contents, bands, 2) limits of bands, by index in
                                  * `row` */
     const float *few_points, *fine_points, *few_weights, *fine_weights;
+    const float *touch_steps, *disc; /* (k, 3) see `steps_of`; (fine, 2) fine points in the unit disc */
 } question;
 
 /* The caller's buffers for the answer. */

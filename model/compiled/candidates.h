@@ -53,7 +53,8 @@ SHARED int ranked_rows(int *chosen_rows, const plates *on, const rules *by, cons
     }
     const grouped all = {.groups = 1, .p = k * p, .others = by->others, .gain_variance = by->gain_variance,
                          .ridge = by->ridge, .points = is_coarse ? on->centers : of->few_points, .weights = weights,
-                         .error = by->search_error, .shares = by->shares};
+                         .error = by->search_error, .shares = by->shares,
+                         .touch_steps = is_coarse ? NULL : of->touch_steps};
     formed found = new_forms(on, &all, memory);
     best reached = {.weights = values(memory, n), .score = ZERO.re, .missed = ZERO.re, .bound = ZERO.re};
     value *target = values(memory, n);
@@ -280,7 +281,8 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
     const grouped each = {.groups = k, .p = of->few, .fine = has_fine ? k * of->fine : 0, .others = by->others,
                           .gain_variance = by->gain_variance, .ridge = by->ridge, .points = of->few_points,
                           .fine_points = of->fine_points, .weights = of->few_weights, .error = by->search_error,
-                          .shares = by->shares, .is_fine = is_fine, .rim = by->is_deep ? 0 : by->rim[1]};
+                          .shares = by->shares, .is_fine = is_fine, .touch_steps = of->touch_steps,
+                          .rim = by->is_deep ? 0 : by->rim[1]};
     formed *found = take(memory, blocks * sizeof(formed));
     searched *forms = take(memory, blocks * sizeof(searched));
     rows_found at = new_rows(blocks * LANES, n, memory);

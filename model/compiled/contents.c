@@ -14,7 +14,8 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
         const arena mark = *memory;
         const size_t some = from->count - first < BATCH ? from->count - first : BATCH;
         const sensors at = {.points = points, .rows = of->fine_points, .weights = of->fine_weights, .error = by->error,
-                            .threshold = by->threshold};
+                            .threshold = by->threshold, .touch_steps = of->touch_steps,
+                            .disc = of->disc};
         const tones drawn = respond(on, draws, &at, columns, some, from->rows + first, from->weights + 2 * n * first, memory);
         const size_t groups = group_count(draws);
         const lanes *harmonics = find_harmonics(&of->harmonics, draws, k, some, from->rows + first,
@@ -304,6 +305,8 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     of.starts = given->numbers, of.targets = of.starts + contents + 1, of.quiet = of.targets + of.starts[contents];
     of.priority = of.quiet + of.quiet_count;
     of.is_ranked = contents == 1 && of.starts[1] == 1 && of.bands == 1 && of.quiet_count > 0 && by->groups == 1;
+    of.disc = read->points + 2 * read->few;
+    of.touch_steps = steps_of(read, given->places, k, by->touch_offset, memory);
     find_rows(&of, of.priority + contents, memory);
     plates twice;
     if (by->at_harmonics) {

@@ -2,6 +2,7 @@
 #ifndef DRAWN_H
 #define DRAWN_H
 
+#include "fingertips.h"
 #include "points.h"
 
 /* Drawn plates, ordered by thickness. The rows of arrays have `width` floats, a register more than there are plates. */
@@ -14,6 +15,7 @@ typedef struct {
     const float *own, *gains;       /* (a, width) own stiffness; (2, a, width) gain errors, real and imaginary parts */
     const float *errors;            /* (2, k, width) field errors at fingers, real and imaginary parts */
     const float *harmonics;         /* (2, n, width) second harmonics of ERAs, relative to their motion */
+    const float *touches;           /* (2, k, width) displacements of fingers along x and y */
     const float *delays;            /* (amplifiers, width) [s] */
     const int *amplifier;           /* (n) amplifier of each ERA */
 } draws;
@@ -23,6 +25,8 @@ typedef struct {
     int points;
     const float *rows, *weights;     /* (points, r); (points) weight in the mean over the fingertip */
     const float *error, *threshold;  /* (f, n) mean square error per ERA; (f) */
+    const float *touch_steps, *disc; /* (k, 3) see `steps_of`, NULL for exact positions of fingers; (points / k, 2) fine
+                                      * points in the unit disc */
 } sensors;
 
 /* Tones (m) at the points: fields at all thicknesses, and linear changes at a few of them (bases). */
@@ -228,6 +232,32 @@ INLINE value late_by(lanes phase) {
     return times(half, half);
 }
 
+/* Displace a finger by x and y standard deviations: change the field at its fine points, in place, by a quadratic
+ * polynomial through some of them; by a gradient for a disc that an edge cuts. disc (count, 2); steps (3): see
+ * `steps_of`. */
+INLINE void displace(value *field, size_t count, const float *disc, const float *steps, lanes x, lanes y) {
+    const value east = field[FINE_ENDS[0][1]], west = field[FINE_ENDS[0][0]], center = field[0];
+    const value north = field[FINE_ENDS[1][1]], south = field[FINE_ENDS[1][0]];
+    value by_xx = ZERO, by_yy = ZERO, by_xy = ZERO, moved = ZERO;
+    by_xx = (value){.re = east.re + west.re - 2 * center.re, .im = east.im + west.im - 2 * center.im};
+    by_yy = (value){.re = north.re + south.re - 2 * center.re, .im = north.im + south.im - 2 * center.im};
+    for (int i = 0; i < 4; i++) {
+        const value own = scaled(field[FINE_DIAGONAL[i]], filled(i % 2 ? -1 : 1));
+        by_xy.re += own.re, by_xy.im += own.im;
+    }
+    x *= steps[0], y *= steps[1];
+    moved.re = x * (east.re - west.re) + y * (north.re - south.re);
+    moved.im = x * (east.im - west.im) + y * (north.im - south.im);
+    x *= 2 * steps[2], y *= 2 * steps[2]; /* in radii */
+    const value along_x = {.re = x * by_xx.re + y * by_xy.re, .im = x * by_xx.im + y * by_xy.im};
+    const value along_y = {.re = x * by_xy.re + y * by_yy.re, .im = x * by_xy.im + y * by_yy.im};
+    moved.re += 0.5f * (x * along_x.re + y * along_y.re), moved.im += 0.5f * (x * along_x.im + y * along_y.im);
+    for (size_t i = 0; i < count; i++) {
+        field[i].re += moved.re + disc[2 * i] * along_x.re + disc[2 * i + 1] * along_y.re;
+        field[i].im += moved.im + disc[2 * i] * along_x.im + disc[2 * i + 1] * along_y.im;
+    }
+}
+
 /* Compute sensed (points): squared amplitudes of a tone relative to the threshold, on a group of plates. */
 SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, value *found, value *force) {
     const draws *by = of->by;
@@ -282,6 +312,9 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
     for (size_t finger = 0; finger < k; finger++) {
         lanes re = of->error[tone] * some(by->errors + finger * width + from);
         lanes im = of->error[tone] * some(by->errors + (k + finger) * width + from);
+        if (of->at->touch_steps)
+            displace(found + finger * each, each, of->at->disc, of->at->touch_steps + 3 * finger,
+                     some(by->touches + finger * width + from), some(by->touches + (k + finger) * width + from));
         for (size_t i = finger * each; i < (finger + 1) * each; i++)
             sensed[i] = above * power((value){.re = found[i].re + re, .im = found[i].im + im});
     }

@@ -17,6 +17,29 @@ typedef struct {
     float *few, *fine, *few_weights, *fine_weights, *centers; /* (k, few, r), (k, fine, r), (k, few), (k, fine), (k, r) */
 } tips;
 
+/* Low and high ends of the disc along x and y, by number among the coarse and the fine points. */
+static const int FEW_ENDS[2][2] = {{3, 1}, {4, 2}}, FINE_ENDS[2][2] = {{15, 9}, {18, 12}};
+
+/* Fine points at (+-1/2, +-1/2), by quadrant. */
+static const int FINE_DIAGONAL[4] = {2, 4, 6, 8};
+
+/* Return (k, 3): standard deviation `offset` [m] of each finger's position along x and y, as a fraction of the distance
+ * between both ends of the disc, and 1 for a disc that no edge cuts, else 0. NULL for exact positions. */
+SHARED float *steps_of(const raster *on, const double *places, size_t k, float offset, arena *memory) {
+    if (offset == 0) return NULL;
+    float *steps = floats(memory, 3 * k);
+    for (size_t finger = 0; finger < k; finger++) {
+        const double sides[2] = {on->length, on->width};
+        steps[3 * finger + 2] = 1;
+        for (int axis = 0; axis < 2; axis++) {
+            const double at = places[2 * finger + axis], low = at - on->radius, high = at + on->radius;
+            steps[3 * finger + axis] = offset / (float)(fmin(high, sides[axis]) - fmax(low, 0));
+            if (low <= 0 || high >= sides[axis]) steps[3 * finger + 2] = 0;
+        }
+    }
+    return steps;
+}
+
 INLINE double within(double a, double low, double high) { return a < low ? low : a > high ? high : a; }
 
 /* Compute the centroid of the part of the unit disc inside a rectangle that contains its center. */

@@ -4,6 +4,7 @@
 
 #include "arena.h"
 #include "fingers.h"
+#include "fingertips.h"
 
 typedef struct {
     int groups, p, fine;       /* groups of points; points per group; fine points of all groups */
@@ -13,6 +14,7 @@ typedef struct {
     const float *error;        /* (f, n) */
     const float *shares;       /* (f, n, n) relative increase of the power of h by clock errors; NULL without errors */
     const char *is_fine;       /* (k) whether fine points of a finger are needed; NULL for all fingers */
+    const float *touch_steps;  /* (k, 3) see `steps_of`; NULL for exact positions of fingers, or points other than the few */
     int rim;                   /* first of a finger's fine points that are needed, apart from its point 0 */
 } grouped;
 
@@ -49,7 +51,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     value *moved = values(memory, a * n), *without = values(memory, b * n), *drives = values(memory, n);
     value *strokes = values(memory, n), *by_damping = values(memory, n), *by_stiffness = values(memory, off);
     value *damped = values(memory, n * n), *changes = values(memory, j * n);
-    value *X = values(memory, (parts * p + j) * n), *R = to->power, *U = to->uncertain;
+    value *X = values(memory, (parts * p + j + 2 * k) * n), *R = to->power, *U = to->uncertain;
     value *modeled = values(memory, n * n);
     lanes *error = take(memory, n * sizeof(lanes)), *shares = take(memory, n * n * sizeof(lanes));
     put_fingers(&now, on, rows, cases, space);
@@ -128,8 +130,18 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
             share = root(share);
             for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
         }
+        for (size_t first = group * p; of->touch_steps && first < (group + 1) * p; first += each) {
+            float share = 0;
+            for (size_t i = first; i < first + each; i++) share += of->weights[i];
+            for (int axis = 0; share != 0 && axis < 2; axis++) {
+                const value *low = h + (first + FEW_ENDS[axis][0]) * n, *high = h + (first + FEW_ENDS[axis][1]) * n;
+                const lanes step = filled(sqrtf(share) * of->touch_steps[3 * (first / each) + axis]);
+                for (size_t e = 0; e < n; e++)
+                    *to++ = scaled((value){.re = high[e].re - low[e].re, .im = high[e].im - low[e].im}, step);
+            }
+        }
         gram(modeled, X, counted, n);
-        gram(form, X + counted * n, (parts - 1) * counted + j, n);
+        gram(form, X + counted * n, (size_t)(to - X) / n - counted, n);
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++) {
                 form[u * n + v].re += modeled[u * n + v].re;

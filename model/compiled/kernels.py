@@ -72,7 +72,7 @@ class PointGroups(Structure):
 
     _fields_ = [
         *_fields(i="groups p fine others", f="gain_variance ridge"),
-        *_fields(p="points fine_points weights error shares is_fine", i="rim"),
+        *_fields(p="points fine_points weights error shares is_fine touch_steps", i="rim"),
     ]
 
 
@@ -81,14 +81,14 @@ class PlateDraws(Structure):
 
     _fields_ = _fields(
         i="count bases nodes width first_base first_node amplifiers",
-        p="node loss damping own gains errors harmonics delays amplifier",
+        p="node loss damping own gains errors harmonics touches delays amplifier",
     )
 
 
 class Sensors(Structure):
     """Observed points of all fingers: `sensors` in C."""
 
-    _fields_ = _fields(i="points", p="rows weights error threshold")
+    _fields_ = _fields(i="points", p="rows weights error threshold touch_steps disc")
 
 
 class WeightSearch(Structure):
@@ -103,7 +103,7 @@ class Rules(Structure):
     _fields_ = [
         *_fields(i="kept missing max_by_point pruning_step"),
         *_fields(i="rim_count is_deep others"),
-        *_fields(f="gain_variance ridge margin highest reached"),
+        *_fields(f="gain_variance touch_offset ridge margin highest reached"),
         *_fields(f="judged promised", i="starts iterations again"),
         ("one_finger", WeightSearch),
         ("several", WeightSearch),

@@ -220,7 +220,7 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
     const arena mark = *memory;
     const size_t plates = 1 + of->promise->count;
     const sensors at = {.points = points, .rows = of->fine_points, .weights = of->fine_weights, .error = by->error,
-                        .threshold = by->threshold};
+                        .threshold = by->threshold, .touch_steps = of->touch_steps, .disc = of->disc};
     const tones drawn = respond(on, of->promise, &at, columns, contents, to->rows, to->weights, memory);
     lanes *powers = take(memory, contents * groups * points * sizeof(lanes));
     value *found = values(memory, points), *force = values(memory, on->b + k + 1);

@@ -68,6 +68,8 @@ class Draws:
     """Second harmonic (n, d) of each ERA relative to its motion."""
     node: IntArray
     """Thickness (d,) of each plate, by number."""
+    touches: Float32Array
+    """Displacement (2, k, d) of each finger from its reported position, along x and along y."""
 
 
 @lru_cache(maxsize=64)
@@ -95,13 +97,12 @@ def draw(
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    # Numbers for feet come last, so that they leave all others unchanged.
-    numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n + to_feet, count)
+    # Numbers for touches and feet come last, so that they leave all others unchanged.
+    counts = [3 + n + k, n, n, k, k, 1, n, n, to_feet]
+    numbers = standard_normal(rng, sum(counts) + 2 * k, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
-    counts = [3 + n + k, n, n, k, k, 1, n, n]
-    parameters, sizes, phases, real, imaginary, common, harmonics, quadrature, feet = np.split(
-        numbers, np.cumsum(counts)
-    )
+    parts = np.split(numbers, np.cumsum(counts))
+    parameters, sizes, phases, real, imaginary, common, harmonics, quadrature, feet, touches = parts
     common = np.where(common > np.median(common), COMMON, -COMMON)
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
     of_masses = np.pad(feet, ((0, masses - to_feet), (0, 0)))
@@ -114,6 +115,7 @@ def draw(
         errors=_complex(real, imaginary),
         harmonics=_complex(harmonics, quadrature, harmonic),
         node=np.arange(count) * thicknesses // count,
+        touches=touches.reshape(2, k, count).astype(np.float32),
     )
     for shared in vars(drawn).values():
         shared.setflags(write=False)  # cached, and so shared

@@ -22,9 +22,9 @@ def expected_power(
     """Compute expected powers R (f, g, n, n) at g groups of points.
 
     fields: h and each of its changes (f, g, p, n); own (f, g, j, n): RMS changes over the points
-    due to the stiffness of each attachment and the load of each finger; weights (g, p): of the
-    points; error_power (f, ..., n): mean square error of each ERA's field; shares (f, n, n): by
-    which delays of amplifiers increase the power of h.
+    due to the stiffness of each attachment, the load of each finger and the positions of fingers;
+    weights (g, p): of the points; error_power (f, ..., n): mean square error of each ERA's field;
+    shares (f, n, n): by which delays of amplifiers increase the power of h.
     """
     frequency_count, group_count, _, era_count = own.shape
     root_weights = np.sqrt(weights)[..., None]

@@ -30,6 +30,7 @@ from model.ensemble.touched_plate import (
     LoadedContacts,
     TouchedPlate,
 )
+from model.finger import FINE_POINTS
 
 _MAX_LANES = 16  # single-precision numbers in the widest register
 _ARRAYS_OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
@@ -57,6 +58,7 @@ class TouchedByKernel(TouchedPlate):
         weights: Float32Array,
         error_power: Float32Array,
         fine: Float32Array | None = None,
+        touch_steps: Float32Array | None = None,
     ) -> LoadedContacts:
         """As `TouchedPlate.forms`."""
         plate = self.plate_on_eras.plate
@@ -77,6 +79,7 @@ class TouchedByKernel(TouchedPlate):
             weights=weights,
             error=error_power,
             shares=self.clocks.power_shares(plate.frequencies),
+            touch_steps=touch_steps,
         )
         by_group = (len(rows), group_count)
         fields = np.empty((*by_group, point_count, era_count), dtype=np.complex64)
@@ -99,6 +102,7 @@ class TouchedByKernel(TouchedPlate):
         error_power: Float32Array,
         threshold: Float32Array,
         *,
+        touch_steps: Float32Array | None = None,
         with_powers: bool = False,
     ) -> FingertipAmplitudes:
         """As `TouchedPlate.drawn`."""
@@ -106,7 +110,14 @@ class TouchedByKernel(TouchedPlate):
         finger_count, point_count = shares.shape
         plate_count = 1 + drawing.count
         sensors = Sensors(finger_count * point_count)
-        sensors.point(rows=points, weights=shares, error=error_power, threshold=threshold)
+        sensors.point(
+            rows=points,
+            weights=shares,
+            error=error_power,
+            threshold=threshold,
+            touch_steps=touch_steps,
+            disc=FINE_POINTS.points,
+        )
         means = np.empty((tone_count, finger_count, plate_count), dtype=np.float32)
         loudest = np.empty_like(means)
         powers = None
@@ -225,6 +236,7 @@ def _packed_draws(plates: DrawnPlates) -> PlateDraws:
         gains=_padded_parts(draws.gains),
         errors=_padded_parts(draws.errors),
         harmonics=_padded_parts(draws.harmonics),
+        touches=_padded(draws.touches),
     )
     return structure
 

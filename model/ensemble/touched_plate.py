@@ -8,7 +8,8 @@ where G is the displacement due to a force at each finger without the others. Wi
 acceleration is -w² G P^T. `attached_plate` defines the symbols; a case is a frequency and a
 thickness. The expected power of weights w at a fingertip is w^H R w to first order,
 
-    R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
+    R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² }
+        + dx* dx^T + dy* dy^T,
 
 with h the field of each ERA, t_pj the acceleration due to a force at attachment j, and r_j the
 deformation of that attachment due to each ERA at full stroke. Each change d is for one standard
@@ -17,7 +18,9 @@ stiffness of each ERA and foot, the load of each finger j, and the gains (by sig
 independently. These are exact derivatives of the loaded plate, except for the local deflection
 under a finger. For the thickness, the term is half the sum of dh* dh^T for the plates thicker and
 thinner by one standard deviation, solved exactly; it includes the modulus (`attached_plate`). The
-effect of the loss factor is negligible.
+effect of the loss factor is negligible. dx and dy are the changes of h along x and y over one
+standard deviation of a finger's position, from the difference between opposite points of the
+fingertip. A finger that is off also loads the plate elsewhere, which changes h far less.
 
 `model.ensemble.kernel_plates` has the same computation in C, and puts fingers on a plate with the
 faster one available.
@@ -40,6 +43,7 @@ from model.ensemble.draws import (
     over_fingertips,
 )
 from model.ensemble.expected_power import expected_power, gram, power_of
+from model.finger import ENDS, FINE_DIAGONAL, FINE_ENDS, FINE_POINTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +154,49 @@ class _Fingers:
         return np.asarray(free - finger_forces.swapaxes(1, 2) @ self.displacement)
 
 
+def _changes_by_position(
+    fields: Complex64Array, weights: Float32Array, steps: Float32Array
+) -> Complex64Array:
+    """Changes (f, g, j, n) of fields (f, g, p, n) for each position along x and y of fingers.
+
+    weights (g, p): of the points, of which each finger has few; steps (k, 3).
+    """
+    frequency_count, group_count, _, era_count = fields.shape
+    fingers_per_group = len(steps) // group_count
+    by_finger = fields.reshape(frequency_count, len(steps), -1, era_count)
+    finger_weights = weights.reshape(len(steps), -1).sum(axis=1)
+    scale = steps[:, :2] * np.sqrt(finger_weights)[:, None]
+    east, north, west, south = (by_finger[:, :, end] for end in ENDS)
+    changes = np.stack([east - west, north - south], axis=2) * scale[:, :, None]
+    return changes.reshape(frequency_count, group_count, 2 * fingers_per_group, era_count)
+
+
+def _displaced(
+    fields: Complex64Array, steps: Float32Array, touches: Float32Array
+) -> Complex64Array:
+    """Change (m, k, fine, d) of fields (m, k, fine, d) by displacements (2, k, d) of fingers.
+
+    From a quadratic polynomial through points of each fingertip, in radii from its center. A
+    fingertip that is cut by an edge has a gradient only.
+    """
+    center = fields[:, :, 0]
+    east, north, west, south = (fields[:, :, end] for end in FINE_ENDS)
+    first, second, third, fourth = (fields[:, :, point] for point in FINE_DIAGONAL)
+    x_steps, y_steps = steps[:, :2].T[:, :, None] * touches
+    whole = 2 * steps[:, 2:]
+    x, y = whole * x_steps, whole * y_steps
+    by_xx = east - 2 * center + west
+    by_yy = north - 2 * center + south
+    by_xy = first - second + third - fourth
+    slope_x = x * by_xx + y * by_xy
+    slope_y = x * by_xy + y * by_yy
+    at_center = x_steps * (east - west) + y_steps * (north - south)
+    at_center = at_center + (x * slope_x + y * slope_y) / 2
+    disc_x, disc_y = FINE_POINTS.points.T.astype(np.float32)[:, :, None]
+    changes = at_center[:, :, None] + slope_x[:, :, None] * disc_x + slope_y[:, :, None] * disc_y
+    return np.asarray(changes, dtype=np.complex64)
+
+
 @dataclass(frozen=True, eq=False)
 class TouchedPlate:
     """A plate of every thickness with k fingers on it."""
@@ -214,12 +261,15 @@ class TouchedPlate:
         weights: Float32Array,
         error_power: Float32Array,
         fine: Float32Array | None = None,
+        touch_steps: Float32Array | None = None,
     ) -> LoadedContacts:
         """Compute fields and expected powers at frequencies, by row (f,).
 
         points (g, p, r), fine (g, fine, r): shapes at groups of points, as under each finger;
         weights (g, p): of a group's points, sum 1; error_power (all, n): mean square of the
-        discretization error of each ERA's field at all frequencies of the plate.
+        discretization error of each ERA's field at all frequencies of the plate; touch_steps (k,
+        3): see `FingertipShapes.touch_steps`, None for exact positions. With steps, the points of a
+        group are the few points of one or more fingers.
         """
         plate = self.plate_on_eras.plate
         modeled = np.full(len(rows), MODELED)
@@ -233,9 +283,13 @@ class TouchedPlate:
             changes += self._changes_by_thickness(rows, all_points, fields)
 
         group_fields = fields.reshape(by_group)
+        own = self._rms_changes_by_stiffness(rows, responses, deformation, weights)
+        if touch_steps is not None:
+            by_position = _changes_by_position(group_fields, weights, touch_steps)
+            own = np.concatenate([own, by_position], axis=2)
         power = expected_power(
             [group_fields, *(change.reshape(by_group) for change in changes)],
-            self._rms_changes_by_stiffness(rows, responses, deformation, weights),
+            own,
             weights,
             gain_variance=plate.uncertainty.gain_variance(plate.era_count),
             error_power=error_power[rows, None],
@@ -346,13 +400,16 @@ class TouchedPlate:
         error_power: Float32Array,
         threshold: Float32Array,
         *,
+        touch_steps: Float32Array | None = None,
         with_powers: bool = False,
     ) -> FingertipAmplitudes:
         """Compute amplitudes on the nominal plate and on drawn ones, of tones at rows (m,).
 
         weights (m, n): of the ERAs; points (k p, r): shapes; shares (k, p): of the points in the
-        mean over a fingertip. At all frequencies of the plate: error_power (f, n), mean square of
-        the discretization error of each ERA's field; threshold (f,) [m/s²].
+        mean over a fingertip; touch_steps (k, 3): see `FingertipShapes.touch_steps`, None for exact
+        positions, otherwise the points are the fine ones. At all frequencies of the plate:
+        error_power (f, n), mean square of the discretization error of each ERA's field; threshold
+        (f,) [m/s²].
         """
         plates = DrawnPlates.of(self.plate_on_eras, len(shares), drawing)
         draws = plates.draws
@@ -363,6 +420,10 @@ class TouchedPlate:
         error = np.sqrt((error_power[rows] * power_of(weights)).sum(axis=1))
         finger_errors = error[:, None, None] * draws.errors
         point_count = shares.shape[1]
+        if touch_steps is not None:
+            by_finger = fields.reshape(len(rows), *shares.shape, -1)
+            changes = _displaced(by_finger, touch_steps, draws.touches)
+            fields = (by_finger + changes).reshape(fields.shape)
         fields += finger_errors.repeat(point_count, axis=1)
 
         squared_threshold = (threshold[rows] ** 2)[:, None, None]

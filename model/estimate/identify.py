@@ -160,6 +160,7 @@ class Identification:
             level=max(original.level, self.fitted.measurement.gain_by_level),
             field=unexplained,
             place=errors["place"],
+            touch_position=original.touch_position,
             harmonic=original.harmonic,
             supports=rms(parameter_stds(space, covariance)[space.groups["supports"]]),
             weather=original.weather,

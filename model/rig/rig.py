@@ -36,6 +36,7 @@ BOUNDS = {
     "field": (0.0, 0.5),
     "modulus": (0.0, 0.1),
     "place": (0.0, 0.01),
+    "touch_position": (0.0, 0.01),
     "harmonic": (0.0, 0.2),
     "supports": (0.0, 0.5),
     "weather": (0.0, 0.5),
@@ -128,6 +129,8 @@ class Uncertainty:
     modes."""
     mode_amplitude: float = 0.0
     """Amplitude of each elastic mode shape individually, relative."""
+    touch_position: float = 0.002
+    """Distance of each finger from the position that the touch source reports, RMS [m]."""
 
     def __post_init__(self) -> None:
         """Reject values that are not finite, negative values, and a factor below 1."""
@@ -163,6 +166,8 @@ class Uncertainty:
             terms.append(f"fingertip x {math.exp(self.fingertip):.2g}")
         if self.place:
             terms.append(f"place {1e3 * self.place:.3g} mm")
+        if self.touch_position:
+            terms.append(f"touch position {1e3 * self.touch_position:.3g} mm")
         if self.foreign_mass:
             terms.append(f"foreign mass {1e3 * self.foreign_mass:.3g} g")
         return ", ".join(terms) or "none"
@@ -195,6 +200,11 @@ class Uncertainty:
     def frequency(self) -> float:
         """Relative standard deviation of natural frequencies, due to thickness and modulus."""
         return math.hypot(self.thickness, self.elasticity / 2)
+
+    @property
+    def touch_offset(self) -> float:
+        """Standard deviation of a touch's position along x and along y [m]."""
+        return self.touch_position / math.sqrt(2)
 
     @property
     def changes_modes(self) -> bool:

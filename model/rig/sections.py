@@ -280,6 +280,12 @@ class UncertaintySection(Section):
     place: Annotated[float, _within("place", LENGTH)] = Uncertainty.place
     """Position of each ERA, along x and along y."""
 
+    touch_position: Annotated[float, _within("touch_position", LENGTH)] = Uncertainty.touch_position
+    """Distance of each finger from the position that the touch source reports, root mean square.
+
+    Without this key, a daemon whose touch source is calibrated by points uses their residual.
+    """
+
     harmonic: Annotated[float, _within("harmonic")] = Uncertainty.harmonic
     """Second harmonic of each ERA's motion relative to its own amplitude, at any phase."""
 

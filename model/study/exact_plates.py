@@ -55,6 +55,8 @@ class Plates:
     modes: FloatArray = field(default_factory=lambda: np.ones((1, 2, 0)))
     """Factors (d, 2, m) on the eigenvalue and the squared size of each of the lowest elastic
     modes."""
+    touches: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 2)))
+    """Displacement (d, contacts, 2) of each finger from its reported position [m]."""
 
 
 def draw_plates(
@@ -81,10 +83,11 @@ def draw_plates(
 
     mode_stds = np.array([[uncertainty.mode_frequency], [uncertainty.mode_amplitude]])
     mode_count = MAX_DEVIATING if mode_stds.any() else 0
-    # Generators of their own: the other draws of a seed do not depend on the number of modes, nor
-    # on how many springs are drawn again.
+    # Generators of their own: the other draws of a seed do not depend on the number of modes, on
+    # how many springs are drawn again, nor on the positions of touches.
     (mode_rng,) = rng.spawn(1)
     (redraw_rng,) = mode_rng.spawn(1)
+    (touch_rng,) = redraw_rng.spawn(1)
     mode_draws = mode_rng.standard_normal((count, 2, mode_count))
 
     # The draws of a seed depend on their order.
@@ -113,6 +116,7 @@ def draw_plates(
         harmonic=uncertainty.harmonic * complex_normal(era_count),
         feet=np.exp(uncertainty.supports * normal(foot_count)),
         modes=(1 + mode_stds * mode_draws) ** 2,
+        touches=uncertainty.touch_offset * touch_rng.standard_normal((count, contact_count, 2)),
     )
 
 
@@ -147,7 +151,7 @@ def powers_on(
 
     The points are the fine points of `read_fingertips`, finger by finger.
     """
-    discs, fingers = touched(table, placed)
+    discs, fingers = touched(table, placed, plates)
     rows, accelerations = _responses(table, discs, fingers, excitation, plates)
     return rows, np.abs(accelerations) ** 2
 
@@ -159,7 +163,7 @@ def harmonics_on(
 
     At the points of `powers_on`.
     """
-    discs, fingers = touched(table, placed)
+    discs, fingers = touched(table, placed, plates)
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = table.rows_of(frequencies)
     distorted = replace(plates, gain=plates.gain * plates.harmonic)
@@ -178,17 +182,31 @@ def amplitudes_on(
 
     points: in meters. plates: drawn with as many contacts as points; their loads have no effect.
     """
-    shapes = table.shapes_at(points)[:, None]
+    shapes = table.shapes_at(points)[None, :, None]
     rows, accelerations = _responses(table, shapes, (), excitation, plates)
     return table.frequencies[rows], np.abs(accelerations)
 
 
 def touched(
-    table: LocalizationTable, placed: Placement
+    table: LocalizationTable, placed: Placement, plates: Plates
 ) -> tuple[FloatArray, Sequence[FingertipLoad]]:
-    """Return the shapes at the fine points of fingers (k, p, r), and their loads."""
-    fine = read_fingertips(table, placed.contacts).fine.astype(float)
-    return fine, fingertip_loads(table.fingertip, placed.contacts, placed.loads)
+    """Return the shapes at the fine points of fingers, see `discs_on`, and their loads."""
+    discs = discs_on(table, placed.contacts, plates)
+    return discs, fingertip_loads(table.fingertip, placed.contacts, placed.loads)
+
+
+def discs_on(table: LocalizationTable, contacts: Sequence[Point], plates: Plates) -> FloatArray:
+    """Return the shapes (d, k, p, r) at the fine points of fingers on d plates.
+
+    contacts: reported positions [m], from which the fingers are displaced on each plate. The first
+    dimension is 1 if the fingers are in the same positions on all plates.
+    """
+    reported = np.array(contacts, dtype=float)
+    touches = plates.touches if plates.touches.any() else np.zeros((1, 1, 2))
+    sides = np.array([table.plate.length, table.plate.width])
+    positions = np.clip(reported + touches[:, : len(reported)], 0.0, sides)
+    fine = read_fingertips(table, positions.reshape(-1, 2).tolist()).fine.astype(float)
+    return fine.reshape(*positions.shape[:2], *fine.shape[1:])
 
 
 def _responses(
@@ -207,7 +225,7 @@ def _responses(
     drive_levels = np.abs(bases) / table.highest_drives[rows]
     error_power = table.field_error_power[rows] * drive_levels**2
     field_errors = np.sqrt(error_power.sum(axis=1))
-    deviations = np.repeat(plates.deviation, discs.shape[1], axis=1)
+    deviations = np.repeat(plates.deviation, discs.shape[2], axis=1)
     errors = np.multiply.outer(deviations, field_errors).swapaxes(1, 2)
     return rows, (accelerations + errors).transpose(1, 2, 0)
 
@@ -224,8 +242,8 @@ def accelerations_on(
     """Solve the acceleration (d, m, c, points) [m/s²] by base motions (m, c, eras) [m].
 
     rows (m,): table rows, whose frequencies determine the stiffness of the attachments. discs
-    (k, p, r): shapes at the points of each finger, whose load acts at its first point. The error of
-    the field is not included.
+    (d or 1, k, p, r): shapes at the points of each finger, whose load acts at its first point. The
+    error of the field is not included.
     """
     check_scales(table.plate, plates.thickness, plates.modulus)
     omega = attached.omega[rows]
@@ -233,7 +251,7 @@ def accelerations_on(
     stiffness_at_rest = _stiffness_at_rest(table, fingers, omega, plates)
     stiffness = np.concatenate([era_stiffness, stiffness_at_rest], axis=-1)
     modal = _modal_receptance(attached.modal[rows], omega, plates)
-    finger_shapes = discs[: len(fingers), 0]
+    finger_shapes = discs[:, : len(fingers), 0]
     shapes = _attachment_shapes(table, finger_shapes, plates.places)[:, None]
     receptance = np.asarray((modal * shapes) @ shapes.swapaxes(2, 3), dtype=complex)
     gains = np.array([era.gain(table.frequencies[rows]) for era in table.eras]).T
@@ -243,8 +261,8 @@ def accelerations_on(
     applied = np.pad(driven, ((0, 0), (0, 0), (0, 0), (0, undriven_count)))
     forces = coupled_forces(receptance, stiffness, applied.swapaxes(2, 3))
     modal_displacements = modal * (forces.swapaxes(2, 3) @ shapes)
-    point_shapes = discs.reshape(-1, discs.shape[-1])
-    displacements = modal_displacements @ point_shapes.T
+    point_shapes = discs.reshape(len(discs), 1, -1, discs.shape[-1])
+    displacements = modal_displacements @ point_shapes.swapaxes(2, 3)
     return -(omega**2)[:, None, None] * displacements
 
 
@@ -294,16 +312,21 @@ def _modal_receptance(nominal: ComplexArray, omega: FloatArray, plates: Plates) 
 def _attachment_shapes(
     table: LocalizationTable, finger_shapes: FloatArray, displacements: FloatArray
 ) -> FloatArray:
-    """Return mode shapes at ERAs, masses and fingers (d, n, r) with ERAs displaced (d, eras, 2)."""
-    nominal = np.vstack([table.attachment_shapes, finger_shapes])
-    shapes = np.repeat(nominal[None], len(displacements), axis=0)
+    """Return mode shapes at ERAs, masses and fingers (d, n, r) with ERAs displaced (d, eras, 2).
+
+    finger_shapes (d or 1, k, r).
+    """
+    plate_count = len(displacements)
+    nominal = np.repeat(table.attachment_shapes[None], plate_count, axis=0)
+    fingers = np.broadcast_to(finger_shapes, (plate_count, *finger_shapes.shape[1:]))
+    shapes = np.concatenate([nominal, fingers], axis=1)
     footprints = footprints_of(table.eras)
     displaced = np.repeat(footprints[None], len(displacements), axis=0)
     sides = np.array([table.plate.length, table.plate.width])
     positions = displaced[:, :, :2] + displacements
     displaced[:, :, :2] = np.clip(positions, 0.0, sides)
     displaced_shapes = table.shapes_at(displaced.reshape(-1, footprints.shape[1]))
-    plate_count, era_count = displaced.shape[:2]
+    era_count = displaced.shape[1]
     displaced_shapes = displaced_shapes.reshape(plate_count, era_count, -1)
     shapes[:, :era_count] += displaced_shapes - table.shapes_at(footprints)
     return shapes

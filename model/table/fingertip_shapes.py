@@ -37,6 +37,13 @@ class FingertipShapes:
     fine: Float32Array
     few_weights: Float32Array
     fine_weights: Float32Array
+    touch_steps: Float32Array | None
+    """Standard deviation (k, 3) of each finger's position along x and y, as a fraction of the
+    distance between both ends of the fingertip, and 1 for a fingertip that no edge cuts, else 0.
+
+    Multiplied by the difference of a field between the ends, a fraction is the field's change. None
+    for exact positions.
+    """
 
 
 def read_fingertips(table: TableRecord, positions: Sequence[Point]) -> FingertipShapes:
@@ -57,7 +64,7 @@ def read_fingertips(table: TableRecord, positions: Sequence[Point]) -> Fingertip
         count,
         *pointers,
     )
-    return FingertipShapes(*results)
+    return FingertipShapes(*results, _touch_steps(table, positions))
 
 
 def fingertips_by_numpy(table: TableRecord, positions: Sequence[Point]) -> FingertipShapes:
@@ -75,7 +82,22 @@ def fingertips_by_numpy(table: TableRecord, positions: Sequence[Point]) -> Finge
         fine=np.ascontiguousarray(shapes[:, _FEW:]),
         few_weights=few_weights[:, :_FEW],
         fine_weights=fine_weights[:, _FEW:],
+        touch_steps=_touch_steps(table, positions),
     )
+
+
+def _touch_steps(table: TableRecord, positions: Sequence[Point]) -> Float32Array | None:
+    """Return the `touch_steps` of fingertips centered at positions [m]."""
+    offset = table.uncertainty.touch_offset
+    if not offset:
+        return None
+    centers = np.array(positions)
+    sides = np.array([table.raster.length, table.raster.width])
+    low = np.maximum(centers - FINGERTIP_RADIUS, 0.0)
+    high = np.minimum(centers + FINGERTIP_RADIUS, sides)
+    steps = offset / (high - low)
+    is_whole = (low > 0).all(axis=1) & (high < sides).all(axis=1)
+    return np.column_stack([steps, is_whole]).astype(np.float32)
 
 
 def given_raster(table: TableRecord) -> GivenRaster:

@@ -7,6 +7,7 @@ it is read in another process, and what it costs the loop.
 import asyncio
 import itertools
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from controller.api.link import default_socket
 from controller.cli.config_cli import config_app
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DAEMON, DaemonConfig, DaemonSection, load_daemon_config
+from controller.daemon.daemon import prepared_table
 from controller.daemon.reload import config_change
 from controller.sources.touch import Touch
 from kit.clock import in_virtual_time
@@ -194,6 +196,52 @@ def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
         assert (placed.x, placed.y) == pytest.approx((1.0, 0.25))
     placed = c.apply(Touch(1, 0.0, 1.0))  # shown at the south-west corner
     assert (placed.x * 0.3048, (1 - placed.y) * 0.2286) == pytest.approx((0.3148, 0.2286))
+
+
+FIVE_POINTS = """touch:
+  - {name: exact, url: "tuio:3333"}
+  - {name: panel, url: "tuio:3334", calibration: {points: [
+     {shown: [0.05, 0.05], at: [0.05, 0.05]}, {shown: [0.25, 0.05], at: [0.25, 0.05]},
+     {shown: [0.25, 0.15], at: [0.25, 0.15]}, {shown: [0.05, 0.15], at: [0.05, 0.15]},
+     {shown: [0.15, 0.1], at: [15.5 cm, 0.1]}]}}
+"""
+"""Four corners of a rectangle, and its middle 5 mm off."""
+
+
+@pytest.mark.parametrize(
+    ("touch", "stated", "expected"),
+    [
+        ("", "", 0.002),
+        (FIVE_POINTS, "", math.sqrt((0.004**2 + 4 * 0.001**2 + 3 * 0.002**2) / 5)),
+        (FIVE_POINTS, "uncertainty: {touch_position: 1 mm}", 0.001),
+        (FIVE_POINTS, "uncertainty: {gain: 0.03}", 0.00253),
+    ],
+    ids=["no source", "calibrated", "stated", "other key stated"],
+)
+def test_touch_position_is_as_uncertain_as_the_calibration(
+    folder: Path, touch: str, stated: str, expected: float
+) -> None:
+    """The fit moves all points by 1 mm, and leaves 4 mm in the middle and 1 mm at the corners.
+
+    With the default of 2 mm for each of the three points that a map fits. A value in the rig file
+    comes first.
+    """
+    with (folder / "rig.yaml").open("a", encoding="utf-8") as rig:
+        rig.write(f"\n{stated}\n")
+
+    config = load_daemon_config(written(folder, touch))
+
+    assert config.touch_position == pytest.approx(expected, rel=1e-3)
+
+
+def test_daemon_promises_with_the_calibrated_touch_position(folder: Path) -> None:
+    """Its table has the value of the configuration; the cached one keeps the rig's."""
+    config = load_daemon_config(written(folder, FIVE_POINTS))
+
+    table = prepared_table(config)
+
+    assert table.uncertainty.touch_position == config.touch_position > 0.002
+    assert config.rig.uncertainty.touch_position == 0.002
 
 
 def test_config_commands_create_and_check_daemon_files(

@@ -349,7 +349,7 @@ def test_lowest_priority_is_held_back() -> None:
 def table() -> LocalizationTable:
     """The paper's plate at 29 frequencies, 10 Hz apart; ERAs move without harmonics."""
     rig = smooth_rig()
-    known = replace(rig.uncertainty, modulus=0.0, place=0.0, harmonic=0.0)
+    known = replace(rig.uncertainty, modulus=0.0, place=0.0, touch_position=0.0, harmonic=0.0)
     return build_table(replace(rig, uncertainty=known), frequencies=np.linspace(40.0, 320.0, 29))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from kit.direct_plate import direct_acceleration
 from kit.plates import LENGTH, WIDTH, contact_sets, smooth_rig
@@ -31,7 +32,7 @@ from model.ensemble.kernel_plates import touch
 from model.ensemble.touched_plate import TouchedPlate
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
-from model.finger import FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
+from model.finger import FINE_POINTS, FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import PointLoad, footprints_of
@@ -210,6 +211,90 @@ def random_weights(rows: int) -> Complex64Array:
 def quadratic_form(forms: Complex64Array, weights: Complex64Array) -> FloatArray:
     """Return w^H R w (f, q) of forms (f, q, n, n) and weights (f, n)."""
     return np.einsum("fi,fqij,fj->fq", weights.conj(), forms, weights).real
+
+
+EXACTLY_KNOWN = Uncertainty.none()
+OFF = replace(EXACTLY_KNOWN, touch_position=0.004)
+"""Fingers 4 mm from where they are reported (root mean square), on a plate that is known."""
+
+
+def table_touched(uncertainty: Uncertainty) -> LocalizationTable:
+    """Return the identified table with another uncertainty, and fingers without a load."""
+    table = identified_table()
+    exact = np.zeros_like(table.discretization_error)
+    return replace(table, uncertainty=uncertainty, discretization_error=exact, fingertip=None)
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_fingers_that_are_off_feel_the_field_where_they_are() -> None:
+    """At each point of their discs: the field that the table has there, within 5 % of its change.
+
+    One finger is cut by an edge, where only the slope of the field counts: within half.
+    """
+    table = table_touched(OFF)
+    places = (*PLACES, (0.008, 0.12))
+    drawing = Drawing(40, 5, 1)
+    rows = np.array([3, 12, 25])
+    weights = random_weights(3)
+    fingers = FingersOnPlate.of(table, places, ())
+
+    powers = fingers.powers(drawing, rows, weights)
+
+    nominal = np.sqrt(powers[..., :1])
+    touches = draw(4, 3, count=40, seed=5, **EXACT_DRIVES).touches
+    per_axis = 0.004 / math.sqrt(2)
+    sides = np.array([LENGTH, WIDTH])
+    for finger, allowed in enumerate((0.05, 0.05, 0.5)):
+        centers = np.array(places[finger]) + per_axis * touches[:, finger].T
+        discs = centers[:, None] + FINGERTIP_RADIUS * FINE_POINTS.points
+        is_on_plate = ((discs > 0) & (discs < sides)).all(axis=2).T
+        fields = table.unit_fields(discs.reshape(-1, 2))[rows]
+        amplitudes = np.abs(np.einsum("mn,mnp->mp", weights, fields)).reshape(3, 40, -1)
+        expected = amplitudes.swapaxes(1, 2) / table.thresholds[rows, None, None]
+        error = np.sqrt(powers[:, finger, :, 1:]) - expected
+        change = expected - nominal[:, finger]
+        assert rms_where(is_on_plate, error) < allowed * rms_where(is_on_plate, change)
+
+
+def rms_where(is_counted: NDArray[np.bool_], values: FloatArray) -> float:
+    """Return the root mean square of values (m, p, d) at some points and plates (p, d)."""
+    return float(np.sqrt((values[:, is_counted] ** 2).mean()))
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_expected_power_counts_fingers_that_are_off() -> None:
+    """w^H R w exceeds that of exact touches by the mean square change over 4000 plates.
+
+    At the center of a fingertip, for weights without a field there.
+    """
+    table = table_touched(OFF)
+    fingers = FingersOnPlate.of(table, PLACES, ())
+    tips = fingers.tips
+    rows = np.array([3, 12, 25])
+    centers = fingers.touched.centers[:1]
+    fields = fingers.touched.forms(rows, centers[None], np.ones((1, 1), np.float32), NO_ERROR)
+    weights = orthogonal(random_weights(3), fields.fields[:, 0, 0])
+
+    forms = [
+        fingers.touched.forms(rows, tips.few, tips.few_weights, NO_ERROR, touch_steps=steps).power
+        for steps in (None, tips.touch_steps)
+    ]
+
+    exact, off = (quadratic_form(power, weights)[:, 0] for power in forms)
+    drawn = fingers.powers(Drawing(4000, 5, 1), rows, weights)[:, 0, 0, 1:]
+    expected = drawn.mean(axis=-1) * table.thresholds[rows] ** 2
+    np.testing.assert_allclose(off - exact, expected, rtol=0.1)
+
+
+NO_ERROR = np.zeros((29, 4), np.float32)
+"""Mean square errors of the fields of four ERAs at the frequencies of `identified_table`."""
+
+
+def orthogonal(weights: Complex64Array, fields: Complex64Array) -> Complex64Array:
+    """Return weights (m, n) without the part that is felt in fields (m, n) of ERAs."""
+    felt = (weights * fields).sum(axis=1, keepdims=True)
+    power = (np.abs(fields) ** 2).sum(axis=1, keepdims=True)
+    return np.asarray(weights - felt / power * fields.conj())
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")

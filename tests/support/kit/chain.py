@@ -49,7 +49,8 @@ _REPORT = 0.010  # s; between two frames of the panel
 class Chain:
     """A chain whose control loop runs once it is open; names of amplifiers as in the rig.
 
-    at: the fingers by id, at x, y [m] of the plate; is_felt: whether they rest on the plate too, or
+    at: the fingers by id, at x, y [m] of the plate; off: their displacement [m] from there, which
+    the panel does not report; is_felt: whether they rest on the plate too, or
     on its panel alone; must_be_felt: whether each that comes must lead to a pattern;
     timeout [s]: how long they are taken for down after a report, None for a panel's;
     far_ends: the amplifiers; applied, silenced, refused, lost, contacts: what the control loop has
@@ -64,6 +65,7 @@ class Chain:
     make_controller: Callable[..., Controller]
     controller: Controller = field(init=False)
     at: dict[int, Position] = field(default_factory=dict)
+    off: dict[int, Position] = field(default_factory=dict)
     is_felt: bool = True
     must_be_felt: bool = True
     timeout: float | None = None
@@ -211,12 +213,20 @@ class Chain:
         """Report where the fingers are, or were some time ago [s]."""
         now, plate = threads.now(), self.far.bench.rig.plate
         if self.is_felt:
-            self.far.bench.place_fingers({str(id): at for id, at in self.at.items()}, now=now)
+            self.far.bench.place_fingers(self.touched_at(), now=now)
         touches = tuple(
             Touch(id, x / plate.length, 1 - y / plate.width) for id, (x, y) in self.at.items()
         )
         frame = TouchFrame("panel", now - ago, touches, self.timeout)
         self.deliver(frame, must_be_felt=self.must_be_felt)
+
+    def touched_at(self) -> dict[str, Position]:
+        """Return where the fingers touch the plate [m], by number as text."""
+        positions = {}
+        for id, (x, y) in self.at.items():
+            dx, dy = self.off.get(id, (0.0, 0.0))
+            positions[str(id)] = (x + dx, y + dy)
+        return positions
 
     def deliver(self, frame: TouchFrame, *, must_be_felt: bool = False) -> None:
         """Deliver a frame to the judges, then to the control loop."""

@@ -116,7 +116,7 @@ def answer(
         >>> one, other = (0.08, 0.06), (0.22, 0.16)
         >>> both = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (one, other)])
         >>> [(each.verdict, f"{each.promised_contrast_db:.0f} dB") for each in both.fingers]
-        [('own', '15 dB'), ('own', '15 dB')]
+        [('own', '14 dB'), ('own', '15 dB')]
     """
     expect_instance(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_instance(

@@ -232,30 +232,30 @@ INLINE value late_by(lanes phase) {
     return times(half, half);
 }
 
-/* Displace a finger by x and y standard deviations: change the field at its fine points, in place, by a quadratic
- * polynomial through some of them; by a gradient for a disc that an edge cuts. disc (count, 2); steps (3): see
- * `steps_of`. */
-INLINE void displace(value *field, size_t count, const float *disc, const float *steps, lanes x, lanes y) {
-    const value east = field[FINE_ENDS[0][1]], west = field[FINE_ENDS[0][0]], center = field[0];
-    const value north = field[FINE_ENDS[1][1]], south = field[FINE_ENDS[1][0]];
-    value by_xx = ZERO, by_yy = ZERO, by_xy = ZERO, moved = ZERO;
-    by_xx = (value){.re = east.re + west.re - 2 * center.re, .im = east.im + west.im - 2 * center.im};
-    by_yy = (value){.re = north.re + south.re - 2 * center.re, .im = north.im + south.im - 2 * center.im};
-    for (int i = 0; i < 4; i++) {
-        const value own = scaled(field[FINE_DIAGONAL[i]], filled(i % 2 ? -1 : 1));
-        by_xy.re += own.re, by_xy.im += own.im;
-    }
+/* Change of the field at a finger's fine points by its displacement: of the mean, and per radius along x and along y. */
+typedef struct {
+    value mean, along_x, along_y;
+} moved;
+
+/* Displace a finger by x and y standard deviations. The change follows from a quadratic polynomial through some of its
+ * points; from a gradient for a disc that an edge cuts. steps (3): see `steps_of`. */
+INLINE moved displaced(const value *field, const float *steps, lanes x, lanes y) {
+    const value center = field[0], west = field[FINE_ENDS[0][0]], east = field[FINE_ENDS[0][1]];
+    const value south = field[FINE_ENDS[1][0]], north = field[FINE_ENDS[1][1]], *first = field + FINE_DIAGONAL[0];
+    const value *second = field + FINE_DIAGONAL[1], *third = field + FINE_DIAGONAL[2], *fourth = field + FINE_DIAGONAL[3];
+    const value by_xx = {.re = east.re + west.re - 2 * center.re, .im = east.im + west.im - 2 * center.im};
+    const value by_yy = {.re = north.re + south.re - 2 * center.re, .im = north.im + south.im - 2 * center.im};
+    const value by_xy = {.re = first->re - second->re + third->re - fourth->re,
+                         .im = first->im - second->im + third->im - fourth->im};
     x *= steps[0], y *= steps[1];
-    moved.re = x * (east.re - west.re) + y * (north.re - south.re);
-    moved.im = x * (east.im - west.im) + y * (north.im - south.im);
+    moved by = {.mean = {.re = x * (east.re - west.re) + y * (north.re - south.re),
+                         .im = x * (east.im - west.im) + y * (north.im - south.im)}};
     x *= 2 * steps[2], y *= 2 * steps[2]; /* in radii */
-    const value along_x = {.re = x * by_xx.re + y * by_xy.re, .im = x * by_xx.im + y * by_xy.im};
-    const value along_y = {.re = x * by_xy.re + y * by_yy.re, .im = x * by_xy.im + y * by_yy.im};
-    moved.re += 0.5f * (x * along_x.re + y * along_y.re), moved.im += 0.5f * (x * along_x.im + y * along_y.im);
-    for (size_t i = 0; i < count; i++) {
-        field[i].re += moved.re + disc[2 * i] * along_x.re + disc[2 * i + 1] * along_y.re;
-        field[i].im += moved.im + disc[2 * i] * along_x.im + disc[2 * i + 1] * along_y.im;
-    }
+    by.along_x = (value){.re = x * by_xx.re + y * by_xy.re, .im = x * by_xx.im + y * by_xy.im};
+    by.along_y = (value){.re = x * by_xy.re + y * by_yy.re, .im = x * by_xy.im + y * by_yy.im};
+    by.mean.re += 0.5f * (x * by.along_x.re + y * by.along_y.re);
+    by.mean.im += 0.5f * (x * by.along_x.im + y * by.along_y.im);
+    return by;
 }
 
 /* Compute sensed (points): squared amplitudes of a tone relative to the threshold, on a group of plates. */
@@ -312,11 +312,20 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
     for (size_t finger = 0; finger < k; finger++) {
         lanes re = of->error[tone] * some(by->errors + finger * width + from);
         lanes im = of->error[tone] * some(by->errors + (k + finger) * width + from);
-        if (of->at->touch_steps)
-            displace(found + finger * each, each, of->at->disc, of->at->touch_steps + 3 * finger,
-                     some(by->touches + finger * width + from), some(by->touches + (k + finger) * width + from));
-        for (size_t i = finger * each; i < (finger + 1) * each; i++)
-            sensed[i] = above * power((value){.re = found[i].re + re, .im = found[i].im + im});
+        if (!of->at->touch_steps) {
+            for (size_t i = finger * each; i < (finger + 1) * each; i++)
+                sensed[i] = above * power((value){.re = found[i].re + re, .im = found[i].im + im});
+            continue;
+        }
+        const moved by_touch = displaced(found + finger * each, of->at->touch_steps + 3 * finger,
+                                         some(by->touches + finger * width + from),
+                                         some(by->touches + (k + finger) * width + from));
+        re += by_touch.mean.re, im += by_touch.mean.im;
+        for (size_t i = finger * each, point = 0; point < each; i++, point++) {
+            const float x = of->at->disc[2 * point], y = of->at->disc[2 * point + 1];
+            sensed[i] = above * power((value){.re = found[i].re + re + x * by_touch.along_x.re + y * by_touch.along_y.re,
+                                              .im = found[i].im + im + x * by_touch.along_x.im + y * by_touch.along_y.im});
+        }
     }
 }
 

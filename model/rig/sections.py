@@ -281,9 +281,8 @@ class UncertaintySection(Section):
     """Position of each ERA, along x and along y."""
 
     touch_position: Annotated[float, _within("touch_position", LENGTH)] = Uncertainty.touch_position
-    """Distance of each finger from the position that the touch source reports, root mean square.
-
-    Without this key, a daemon whose touch source is calibrated by points uses their residual.
+    """Distance of each finger from the position that the touch source reports, root mean square; a
+    calibration by points [replaces the default](touch.md#from-the-sensor-to-the-plate).
     """
 
     harmonic: Annotated[float, _within("harmonic")] = Uncertainty.harmonic

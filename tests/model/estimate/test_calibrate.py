@@ -281,6 +281,7 @@ def test_calibrate_refuses_what_tells_nothing(coarse: Rig, truth: Rig) -> None:
         calibrate(coarse, replace(responses, values=loud_values))
 
 
+@pytest.mark.long
 def test_calibrate_is_not_good_for_a_plate_that_is_shorter_than_its_rig() -> None:
     """A plate 20 % longer in its rig is fitted with nearly no loss, whose error is limited."""
     paper = make_paper_rig(12, 9)

@@ -36,6 +36,10 @@ OH_AND_CHOI = ((40.0, 3.5), (250.0, -7.0))
 """Thresholds of pressing fingers relative to the probe's, by frequency [Hz] in dB."""
 STUDIED = (40.0, 100.0, 250.0, 500.0)
 """Frequencies [Hz] at which a person differs from the mean independently, by 4 dB."""
+PEOPLE = 0.5
+"""Standard deviation of the logarithm of a finger's load between people who press equally hard."""
+COVERED = "rig for 0.3 to 2 N"
+"""A rig with 1.8 times the contact, and `fingertip: 0.8` (docs/concepts/people.md)."""
 OH_CHOI, DRAWN = "Oh and Choi", "drawn"
 
 
@@ -47,7 +51,8 @@ class Situation:
     for the corner farthest from both; size, reported [mm]: longer axis of the hand, and the value
     that the touch source reports. surplus: number of fingers that feel nothing. mass [kg]: of an
     object. is_counted: whether the answer counts the hand, the surplus fingers or the object. force
-    [N]: of all fingers; fingertip: uncertainty that the answer counts, None for the rig's. off [m]:
+    [N]: of all fingers, whose loads vary between people by PEOPLE; load: of both fingers that the
+    answer counts, in the rig's fingertips; fingertip: uncertainty of loads that it counts. off [m]:
     distance of both fingers from their reported positions, in any direction, None for a distance
     drawn within the rig's uncertainty; touch_position: as fingertip. person: the difference of the
     thresholds.
@@ -62,7 +67,8 @@ class Situation:
     mass: float = 0.0
     is_counted: bool = True
     force: float = LIGHT_FORCE
-    fingertip: float | None = None
+    load: float = 1.0
+    fingertip: float = PEOPLE
     off: float | None = None
     touch_position: float | None = None
     person: str = ""
@@ -92,10 +98,10 @@ def situations() -> Iterator[Situation]:
         yield Situation(
             f"{stated}, `touch_position: {1e3 * off:g} mm`", off=off, touch_position=off
         )
-    yield Situation("force of 1 N", force=1.0)
-    yield Situation("force of 2 N", force=2.0)
-    yield Situation("force of 2 N, fingertip: 0.9", force=2.0, fingertip=0.9)
-    yield Situation("force of 3 N", force=3.0)
+    for force in (0.3, 1.0, 2.0, 3.0):
+        pressing = Situation(f"force of {force:g} N", force=force)
+        yield pressing
+        yield replace(pressing, name=f"{pressing.name}, {COVERED}", load=1.8, fingertip=0.8)
     yield Situation("person according to Oh and Choi", person=OH_CHOI)
     yield Situation("person, 4 dB at four frequencies", person=DRAWN)
 
@@ -141,11 +147,9 @@ class _Scene:
 
     def _known(self) -> dict[str, float]:
         """Return the uncertainty that the answer counts in place of the rig's."""
-        known = {}
-        for key in ("fingertip", "touch_position"):
-            stated = getattr(self._situation, key)
-            if stated is not None:
-                known[key] = stated
+        known = {"fingertip": self._situation.fingertip}
+        if self._situation.touch_position is not None:
+            known["touch_position"] = self._situation.touch_position
         if self._situation.mass and self._situation.is_counted:
             known["foreign_mass"] = self._situation.mass
         return known
@@ -200,7 +204,8 @@ class _Scene:
 
     def answer(self) -> Answer:
         """Return the answer to the situation as far as it is counted."""
-        fingers = [Finger(at, Stimulus(LEVEL_DB_SL)) for at in self._fingers]
+        stimulus = Stimulus(LEVEL_DB_SL)
+        fingers = [Finger(at, stimulus, load=self._situation.load) for at in self._fingers]
         quiet = []
         if self._situation.is_counted and self._hand is not None:
             load = IN_MM.load(touch_major=self._situation.reported) or 0.0
@@ -231,10 +236,8 @@ class _Scene:
         return np.asarray(np.array(contrasts).reshape(-1, 2, count).min(axis=0))
 
     def _draw_plates(self, count: int) -> Plates:
-        """Draw plates; a force that is stated has no further uncertainty."""
-        uncertainty = self._table.uncertainty
-        if self._situation.force != LIGHT_FORCE:
-            uncertainty = replace(uncertainty, fingertip=0.0)
+        """Draw plates; the loads of people vary by PEOPLE, whatever the answer counts."""
+        uncertainty = replace(self._table.uncertainty, fingertip=PEOPLE)
         contacts = 2 + len(self._loads)
         plates = draw_plates(
             self._rng, uncertainty, of=self._table, count=count, contact_count=contacts

@@ -79,10 +79,8 @@ def given(
     touches = _touches(rig, plates, max(len(each.contents.places) for each in answers), seed)
     for number, drawn in enumerate(_drawn_plates(table, rig, plates, seed)):
         for row, each in enumerate(answers):
-            places = [
-                (x + dx, y + dy)
-                for (x, y), (dx, dy) in zip(each.contents.places, touches[number], strict=False)
-            ]
+            positions = zip(each.contents.places, touches[number], strict=False)
+            places = tuple((x + dx, y + dy) for (x, y), (dx, dy) in positions)
             layers = range(len(each.layers))
             own, *others = (_felt_on(*drawn, each, places, layer) for layer in layers)
             heard = sum(power[0] for _, power in others) if others else own[1][1:].max()
@@ -94,7 +92,8 @@ def _touches(rig: Rig, plates: int, fingers: int, seed: int) -> list[list[list[f
     """Draw the displacement (plates, fingers, 2) [m] of fingers from their reported positions."""
     rng = np.random.default_rng([seed, 1])
     drawn = rig.uncertainty.touch_offset * rng.standard_normal((plates, fingers, 2))
-    return drawn.tolist()
+    displacements: list[list[list[float]]] = drawn.tolist()
+    return displacements
 
 
 def _drawn_plates(
@@ -167,7 +166,7 @@ def _felt_on(
     gains: ComplexArray,
     harmonic: ComplexArray,
     answer: Answer,
-    places: Sequence[Point],
+    places: tuple[Point, ...],
     number: int,
 ) -> tuple[float, FloatArray]:
     """Return the power to threshold of a layer at its first finger, and at all loudest points (k,).
@@ -175,7 +174,7 @@ def _felt_on(
     places: where the fingers of the answer touch the plate [m]. It is evaluated over the duration,
     at the strongest moments of a course, or in the steady state of a continuous layer.
     """
-    contents, power = replace(answer.contents, places=tuple(places)), 0.0
+    contents, power = replace(answer.contents, places=places), 0.0
     steady = RingingUnderFingers(
         table, places, contents.loads, DriveEnvelope(np.ones(2), 1e-3, 1, share=0.0)
     )

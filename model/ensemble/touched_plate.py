@@ -168,7 +168,8 @@ def _changes_by_position(
     scale = steps[:, :2] * np.sqrt(finger_weights)[:, None]
     east, north, west, south = (by_finger[:, :, end] for end in ENDS)
     changes = np.stack([east - west, north - south], axis=2) * scale[:, :, None]
-    return changes.reshape(frequency_count, group_count, 2 * fingers_per_group, era_count)
+    by_group = (frequency_count, group_count, 2 * fingers_per_group, era_count)
+    return np.asarray(changes.reshape(by_group))
 
 
 def _displaced(

@@ -205,7 +205,8 @@ def discs_on(table: LocalizationTable, contacts: Sequence[Point], plates: Plates
     touches = plates.touches if plates.touches.any() else np.zeros((1, 1, 2))
     sides = np.array([table.plate.length, table.plate.width])
     positions = np.clip(reported + touches[:, : len(reported)], 0.0, sides)
-    fine = read_fingertips(table, positions.reshape(-1, 2).tolist()).fine.astype(float)
+    centers = [(x, y) for x, y in positions.reshape(-1, 2).tolist()]
+    fine = read_fingertips(table, centers).fine.astype(float)
     return fine.reshape(*positions.shape[:2], *fine.shape[1:])
 
 

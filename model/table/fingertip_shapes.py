@@ -64,7 +64,9 @@ def read_fingertips(table: TableRecord, positions: Sequence[Point]) -> Fingertip
         count,
         *pointers,
     )
-    return FingertipShapes(*results, _touch_steps(table, positions))
+    few, fine, few_weights, fine_weights = results
+    steps = _touch_steps(table, positions)
+    return FingertipShapes(few, fine, few_weights, fine_weights, steps)
 
 
 def fingertips_by_numpy(table: TableRecord, positions: Sequence[Point]) -> FingertipShapes:

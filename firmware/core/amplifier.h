@@ -16,6 +16,8 @@
 
 struct layer {
     uint16_t token, ramp, valid_for; // of the set that plays
+    uint16_t former_token;           // that Status shows until the samples since `began` come out
+    uint64_t began;                  // sample of a start at a moment or after onsets; 0: at a request
     struct timer ends;
     uint32_t waits; // samples until the set that waits starts; 0: none waits
     bool starts, is_over; // with the sample just made

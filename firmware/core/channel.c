@@ -131,7 +131,7 @@ static uint64_t magnitude(int64_t re, int64_t im)
     return (uint64_t)square_root((uint64_t)(re * re) + (uint64_t)(im * im)) * VOICES_KEPT;
 }
 
-uint16_t channel_level(const struct channel *channel, uint32_t clock)
+uint16_t channel_level(const struct channel *channel, uint32_t clock, uint32_t before)
 {
     uint64_t size = 0;
     bool is_counted[VOICES_KEPT] = {false};
@@ -144,7 +144,7 @@ uint16_t channel_level(const struct channel *channel, uint32_t clock)
             if (is_counted[j] || !voice->is_playing ||
                 voice->frequency != channel->voices[i].frequency)
                 continue;
-            struct complex pointer = voice_pointer(voice, clock);
+            struct complex pointer = voice_pointer(voice, clock, before);
             re += pointer.re;
             im += pointer.im;
             is_counted[j] = true;

@@ -17,20 +17,34 @@
 #define PRODUCT "Example firmware"
 #define FIRMWARE_VERSION "2.0"
 
-// Memory goes with channels, layers, voices, knots and the words of a set: 1 to 16 channels, 4 to 16
-// layers, at least 8 voices of each channel and 512 words.
+// Channels, layers, voices and set words determine memory and load: 1 to 16 channels, 4 to 16 layers,
+// at least 8 voices of each channel and 512 words. The values below fit an RP2350 and an STM32G4 with
+// all voices on their ramps (`make cost`). For an RP2040: 1 channel at 8 kHz.
+//
+// NOT_REAL_TIME: a program on a computer, in tests or in QEMU. It carries more, but can be paused.
+#ifdef NOT_REAL_TIME
+#define CHANNELS_DEFAULT 4
+#define LATE_MAX 3000 // beyond any watchdog and ramp
+#else
+#define CHANNELS_DEFAULT 2
+#endif
 #ifndef CHANNELS
-#define CHANNELS 4
+#define CHANNELS CHANNELS_DEFAULT
 #endif
 #define CHANNELS_MAX CHANNELS // a constant, for memory
-#ifdef SMALLEST
-#define LAYERS 4
-#define VOICES 8
-#define STREAM_WORDS 512
-#else
+#if defined NOT_REAL_TIME && !defined SMALLEST
 #define LAYERS 8
 #define VOICES 16
 #define STREAM_WORDS 1024 // of a set
+#endif
+#ifndef LAYERS
+#define LAYERS 4
+#endif
+#ifndef VOICES
+#define VOICES 8
+#endif
+#ifndef STREAM_WORDS
+#define STREAM_WORDS 512
 #endif
 #define ENVELOPE_KNOTS 32
 

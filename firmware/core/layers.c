@@ -73,8 +73,17 @@ static void wait(struct layer *layer, struct layer_head head, const uint16_t *wo
     memcpy(layer->waiting, words, layer->waiting_count * sizeof *words);
 }
 
-// Start what was committed with the next sample.
-static void start_set(struct amplifier *amplifier)
+// Let Status show the former token of a layer until the next sample comes out.
+static void begin_later(struct amplifier *amplifier, uint8_t number)
+{
+    struct layer *layer = &amplifier->layers[number];
+    bool is_playing = amplifier_layers(amplifier) >> number & 1;
+    layer->former_token = is_playing ? layer->token : 0;
+    layer->began = amplifier->sample;
+}
+
+// Start the committed set with the next sample, at a request or at its moment.
+static void start_set(struct amplifier *amplifier, bool is_request)
 {
     struct waiting_set *set = &amplifier->waiting;
     struct reader reader = reader_of(set->words, set->count);
@@ -88,6 +97,9 @@ static void start_set(struct amplifier *amplifier)
         } else if (waits > 0) {
             wait(layer, head, words, &reader, set->token, waits);
         } else {
+            layer->began = 0;
+            if (!is_request)
+                begin_later(amplifier, head.layer);
             start(amplifier, head, &reader, set->token);
         }
     }
@@ -107,14 +119,14 @@ void amplifier_commit(struct amplifier *amplifier, uint16_t at)
     struct waiting_set *set = &amplifier->waiting;
     uint16_t ahead = (uint16_t)(at - (amplifier_clock(amplifier) >> 16));
     if (set->token > 0) // it goes first
-        start_set(amplifier);
+        start_set(amplifier, true);
     set->token = amplifier->committed = intake->token;
     set->at = (uint32_t)at << 16;
     set->count = intake->count;
     memcpy(set->words, intake->words, intake->count * sizeof *set->words);
     intake_drop(intake);
     if (ahead < 1 || ahead > AHEAD_MAX || is_due(amplifier))
-        start_set(amplifier);
+        start_set(amplifier, true);
 }
 
 static void end(struct amplifier *amplifier, uint8_t number)
@@ -133,12 +145,13 @@ void layers_sample(struct amplifier *amplifier)
         layer->starts = layer->waits > 0 && --layer->waits == 0;
     }
     if (is_due(amplifier))
-        start_set(amplifier);
+        start_set(amplifier, false);
     for (uint8_t i = 0; i < LAYERS; i++) {
         struct layer *layer = &amplifier->layers[i];
         if (layer->starts) {
             struct reader reader = reader_of(layer->waiting, layer->waiting_count);
             struct layer_head head = read_layer(&reader);
+            begin_later(amplifier, i);
             start(amplifier, head, &reader, layer->waiting_token);
         } else if (layer->is_over) {
             end(amplifier, i);

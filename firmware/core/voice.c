@@ -48,14 +48,18 @@ static int32_t between(int32_t from, int32_t to, int32_t way)
     return (int32_t)(from + ((((int64_t)to - from) * way) >> 30));
 }
 
-static struct complex present(const struct voice *voice)
+// Amplitude at a position on the present line.
+static struct complex amplitude_at(const struct voice *voice, uint32_t along)
 {
-    if (voice->stride == 0)
-        return voice->to;
-    int32_t way = voice->path.knots > 0 ? (int32_t)(voice->along >> 2) : raised_cosine(voice->along);
+    int32_t way = voice->path.knots > 0 ? (int32_t)(along >> 2) : raised_cosine(along);
     struct complex amplitude = {.re = between(voice->from.re, voice->to.re, way),
                                 .im = between(voice->from.im, voice->to.im, way)};
     return amplitude;
+}
+
+static struct complex present(const struct voice *voice)
+{
+    return voice->stride > 0 ? amplitude_at(voice, voice->along) : voice->to;
 }
 
 static struct complex target(const struct voice *voice, uint8_t knot)
@@ -155,9 +159,17 @@ int32_t voice_sample(struct voice *voice, uint32_t clock)
     return value;
 }
 
-struct complex voice_pointer(const struct voice *voice, uint32_t clock)
+static struct complex earlier(const struct voice *voice, uint32_t before)
 {
-    struct complex amplitude = present(voice);
+    uint64_t way = (uint64_t)voice->stride * before;
+    if (voice->stride == 0)
+        return voice->to;
+    return way <= voice->along ? amplitude_at(voice, voice->along - (uint32_t)way) : voice->from;
+}
+
+struct complex voice_pointer(const struct voice *voice, uint32_t clock, uint32_t before)
+{
+    struct complex amplitude = earlier(voice, before);
     uint32_t angle = voice->frequency * clock;
     int32_t re = cosine(angle), im = sine(angle);
     struct complex turned = {.re = times(amplitude.re, re) - times(amplitude.im, im),

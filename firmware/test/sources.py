@@ -22,6 +22,7 @@ PROGRAMS: Mapping[tuple[str, ...], Sequence[str]] = {
     (*_CORE, "firmware/ports/posix", "firmware/test"): ["-std=c99"],
     (*_CORE, "firmware/ports/sound"): ["-std=c99", '-DCONFIG_FILE="sound_config.h"'],
     (*_CORE, "firmware/ports/cortex-m"): ["-std=c99", _ARM],
+    (*_CORE, "firmware/ports/cortex-m", "firmware/test/cost"): ["-std=c99", _ARM],
     ("examples/smallest_amplifier", "tests/programs"): ["-std=c11", "-D_GNU_SOURCE"],
     ("model/compiled", "tests/model"): ["-std=gnu11", "-DLANES=4"],
 }

@@ -79,11 +79,16 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
                 (amplifier->measured.is_interlock_open ? FLAG_INTERLOCK_OPEN : 0) |
                 (amplifier->is_limited ? FLAG_LIMITED : 0);
     const uint32_t clock = (uint32_t)(amplifier->clock >> 32);
+    const uint32_t buffered = (uint32_t)(amplifier->ahead > 0 ? amplifier->ahead - 1 : 0) >> 16;
     const uint16_t playing = amplifier_layers(amplifier);
     for (unsigned i = 0; i < CHANNELS; i++)
-        levels[i] = channel_level(&amplifier->channels[i], clock);
-    for (uint8_t i = 0; i < LAYERS; i++)
-        tokens[i] = playing >> i & 1 ? amplifier->layers[i].token : 0;
+        levels[i] = channel_level(&amplifier->channels[i], clock, buffered);
+    for (uint8_t i = 0; i < LAYERS; i++) {
+        const struct layer *layer = &amplifier->layers[i];
+        bool is_buffered = layer->began + buffered > amplifier->sample;
+        uint16_t present_token = playing >> i & 1 ? layer->token : 0;
+        tokens[i] = is_buffered ? layer->former_token : present_token;
+    }
     struct wire_status status = {
         .state = (uint16_t)amplifier->state,
         .fault = (uint16_t)amplifier->fault,

@@ -234,10 +234,15 @@ class MovedFirmware:
 
 
 class FirmwareEnd:
-    """Firmware at address 1, the far end of a kind of wire; folder: its library."""
+    """Firmware at address 1, the far end of a kind of wire; folder: its library.
 
-    def __init__(self, kind: str, folder: Path, send: Callable[[bytes], None]) -> None:
-        self._firmware = MovedFirmware(folder)
+    buffered: samples that it makes ahead.
+    """
+
+    def __init__(
+        self, kind: str, folder: Path, send: Callable[[bytes], None], *, buffered: int = 0
+    ) -> None:
+        self._firmware = MovedFirmware(folder, buffered=buffered)
         self._began = threads.now()
         self._line, self._send = LINES[kind], send
         self._reader = TextReader(SLCAN)

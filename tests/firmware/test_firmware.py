@@ -497,6 +497,10 @@ def check_samples(pair: Pair, chance: random.Random, pause: int) -> None:
     assert compared == pytest.approx(expected, abs=TOLERANCE), pair.time
 
 
+BUFFERED = ["ramps", "starts_at_its_moment", "voices"]
+"""Checks of levels and tokens at exact times."""
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("kind", FIRMWARE_KINDS)
 def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
@@ -515,6 +519,17 @@ def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     if kind in ("rtu", "tcp"):
         expected.add("events")
     assert skipped == expected
+
+
+@pytest.mark.parametrize("names", shortly([[], BUFFERED], [BUFFERED]))
+def test_firmware_with_samples_ahead_passes_conformance(names: list[str], replaying: Path) -> None:
+    """With 3 samples in the converter's buffer, Status shows levels and tokens of the output."""
+    far = partial(FirmwareEnd, "serial", replaying, buffered=3)
+
+    results = judged("serial", names, far=far)
+
+    failures = {result.check.name: result.reason for result in results if result.result == "failed"}
+    assert failures == {}
 
 
 SAMPLE_TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
@@ -656,13 +671,13 @@ def test_high_voltage_is_measured_as_soon_as_it_is_switched(replaying: Path) -> 
 
 @pytest.fixture(scope="module")
 def in_real_time(compiled: Path) -> Path:
-    """The firmware as for a board, where samples can be at most 4 ms late."""
+    """The firmware as configured for a board: 2 channels, samples at most 4 ms late."""
     return build_firmware(compiled / "in-real-time", "era-moved.so", "NOT_REAL_TIME=")
 
 
 def playing(folder: Path) -> MovedFirmware:
     """Firmware that has played a tone on channel 0 for 0.1 s."""
-    firmware = MovedFirmware(folder)
+    firmware = MovedFirmware(folder, channels=2)
     firmware.receive(SERIAL, arm(250))
     firmware.receive(SERIAL, apply(1, command(0, 100, 0.5)))
     firmware.move(0.1)

@@ -72,7 +72,7 @@ class Lateness:
         self.delay = max(self.delay, delay)
         self.largest = max(self.largest, delay)
 
-    def begin_attempt(self) -> None:
+    def start_attempt(self) -> None:
         """Forget the lateness of the attempt before."""
         self.lag = 0.0
         self.delay = 0.0
@@ -94,7 +94,7 @@ class Lateness:
     def measured(self) -> Iterator[None]:
         """Measure this machine's lateness during a check."""
         self.attempts = 0
-        self.begin_attempt()
+        self.start_attempt()
         measuring = asyncio.create_task(self._measure(), name="how late this machine is")
         try:
             yield

@@ -144,7 +144,7 @@ class ConformanceRun:
         doubtful_violations = 0
         while True:
             started_at = threads.now()
-            lateness.begin_attempt()
+            lateness.start_attempt()
             attempt = await self._attempt(check)
             is_late = isinstance(attempt.outcome, TooLate)
             # A violation seen while something is late counts only if it is seen repeatedly.

@@ -17,6 +17,8 @@ void board_shut_down(void);
 
 void tick(void);
 
+#define STACK_PAINT UINT32_C(0xA5A5A5A5)
+
 // Bytes of the stack in use or used since the reset.
 uint32_t stack_used(void);
 

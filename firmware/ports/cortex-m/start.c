@@ -9,7 +9,6 @@
 #include <stddef.h>
 #include <string.h>
 
-#define PAINT UINT32_C(0xA5A5A5A5)
 #define RESET_FRAME 32 // words that `reset` itself may use
 
 extern uint32_t data_begin[], data_end[], data_in_code[], bss_begin[], bss_end[];
@@ -35,19 +34,11 @@ void reset(void)
     uint32_t *frame;
     __asm volatile("mov %0, sp" : "=r"(frame));
     for (uint32_t *word = stack_low; word < frame - RESET_FRAME; word++)
-        *word = PAINT;
+        *word = STACK_PAINT;
     memcpy(data_begin, data_in_code, bytes_between(data_begin, data_end));
     memset(bss_begin, 0, bytes_between(bss_begin, bss_end));
     main();
     shut_down();
-}
-
-uint32_t stack_used(void)
-{
-    const uint32_t *word = stack_low;
-    while (word < stack_top && *word == PAINT)
-        word++;
-    return (uint32_t)bytes_between(word, stack_top);
 }
 
 typedef void handler(void);

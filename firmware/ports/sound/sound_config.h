@@ -41,6 +41,7 @@ extern struct sound_format sound_format;
 #define ENVELOPE_STEP_MIN 10
 #define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
+#define LATE_MAX 4 // of the main loop on boards, which is not used here
 #define CLOCK_ERROR 65535 // not known: times of servers and drivers were not measured on a card
 
 #define FAULTS_KEPT 16

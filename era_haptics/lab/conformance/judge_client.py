@@ -15,7 +15,7 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import NAK, NAK_RECORD, REACTION, REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.wires.wire import read_nak
-from era_haptics.lab.conformance.lateness import Lateness
+from era_haptics.lab.conformance.lateness import ON_THE_WAY, Lateness
 from era_haptics.lab.conformance.outcomes import NoReply, expect_equal, read_as, verify
 from era_haptics.lab.expectations.tolerances import Interval
 from registry import threads
@@ -269,7 +269,7 @@ class JudgeClient(ABC):
         is_sound = not remark or has_new_message
         if is_sound and await self.next_message(is_meant, _DELIVERY_TIMEOUT):
             self.lateness.note_delay(self.timeout)
-            remark = ", but later"
+            remark = f", but later: a delay of {ON_THE_WAY}, or of the amplifier"
         raise NoReply(request, f"no reply within {self.timeout:g} s{remark}")
 
     def remark(self) -> str:

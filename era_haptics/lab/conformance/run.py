@@ -151,7 +151,8 @@ class ConformanceRun:
             is_violation = isinstance(attempt.outcome, ContractViolation)
             is_doubtful = is_violation and lateness.is_disturbing
             doubtful_violations += is_doubtful
-            is_unconfirmed = is_doubtful and doubtful_violations < FEW
+            is_seldom_seen = doubtful_violations < FEW and not lateness.slow_reply
+            is_unconfirmed = is_doubtful and is_seldom_seen
             if attempt.obstacle or not (is_late or is_unconfirmed):
                 return attempt
             if not lateness.repeats(started_at):

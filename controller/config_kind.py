@@ -18,6 +18,8 @@ class CheckedFile:
     warnings: Sequence[str] = ()
     data: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of the report as JSON."""
+    rows: Sequence[str] = ()
+    """Further lines, after the warnings."""
 
 
 @dataclass(frozen=True)

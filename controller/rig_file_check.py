@@ -36,7 +36,7 @@ from model.rig.rig_warnings import (
 from model.rig.sections import LimitsSection
 from model.structure.statics import support_problem
 from model.structure.surface import center_of_surface
-from model.study.promise_cost import clock_cost, uncertainty_cost
+from model.study.promise_cost import ToleranceCosts, clock_cost, cost_rows, uncertainty_costs
 from model.transients.excursions import excursion_notes
 
 _LOST_DB = 0.1
@@ -80,8 +80,21 @@ def check_rig(document: Document) -> CheckedFile:
             summary = summary_line(rig, verdict="tips over")
         else:
             summary += f", {balance.phrase}"
-    warnings = _rig_warnings(rig, balance, [*link_warnings, *clock_warnings])
-    return CheckedFile(summary + clock_line, warnings, data | clock_data)
+    costs = _tolerance_costs(rig)
+    warnings = _rig_warnings(rig, balance, costs, [*link_warnings, *clock_warnings])
+    rows: list[str] = []
+    if costs is not None:
+        rows = cost_rows(rig.uncertainty, costs)
+        data["promised_contrast_db"] = costs.promised_db
+        data["tolerance_costs_db"] = dict(costs.costs_db)
+    return CheckedFile(summary + clock_line, warnings, data | clock_data, rows)
+
+
+def _tolerance_costs(rig: Rig) -> ToleranceCosts | None:
+    """Return the costs of a rig's tolerances; None for a rig without a table."""
+    with contextlib.suppress(InputError):
+        return uncertainty_costs(rig)
+    return None
 
 
 def _link_problems(document: Document, errors: Mapping[str, str]) -> Iterator[ConfigProblem]:
@@ -90,7 +103,12 @@ def _link_problems(document: Document, errors: Mapping[str, str]) -> Iterator[Co
         yield document.problem(("amplifiers", name, "url"), message)
 
 
-def _rig_warnings(rig: Rig, balance: RigBalance | None, link_warnings: list[str]) -> list[str]:
+def _rig_warnings(
+    rig: Rig,
+    balance: RigBalance | None,
+    costs: ToleranceCosts | None,
+    link_warnings: list[str],
+) -> list[str]:
     """Return all warnings about a rig; link_warnings: about its wires and clocks."""
     warnings = [
         *exciter_notes(rig),
@@ -99,7 +117,7 @@ def _rig_warnings(rig: Rig, balance: RigBalance | None, link_warnings: list[str]
         *link_warnings,
         *gain_notes(rig),
         *plate_notes(rig),
-        *_cost_notes(rig),
+        *_cost_notes(rig, costs),
         *mount_notes(rig),
     ]
     if balance is not None:
@@ -124,13 +142,13 @@ def _support_problems(document: Document, rig: Rig) -> list[ConfigProblem]:
     return [] if message is None else [document.problem(("eras",), message)]
 
 
-def _cost_notes(rig: Rig) -> Iterator[str]:
+def _cost_notes(rig: Rig, costs: ToleranceCosts | None) -> Iterator[str]:
     """Yield the contrast that loads and weather cost if the rig states them."""
     foreign_mass = rig.uncertainty.foreign_mass
     if foreign_mass:
         cause = f"uncertainty.foreign_mass: with {1e3 * foreign_mass:.3g} g anywhere on the plate"
         remedy = "list permanent loads under masses"
-        yield from _uncertainty_note(rig, "foreign_mass", cause=cause, remedy=remedy)
+        yield from _uncertainty_note(costs, "foreign_mass", cause=cause, remedy=remedy)
     weather = rig.uncertainty.weather
     if weather:
         cause = (
@@ -138,7 +156,7 @@ def _cost_notes(rig: Rig) -> Iterator[str]:
             "standard deviation;"
         )
         remedy = "narrow the range, or measure again when the season changes"
-        yield from _uncertainty_note(rig, "weather", cause=cause, remedy=remedy)
+        yield from _uncertainty_note(costs, "weather", cause=cause, remedy=remedy)
         return
     plate_keys: Any = {}
     if rig.document is not None:
@@ -151,11 +169,15 @@ def _cost_notes(rig: Rig) -> Iterator[str]:
         )
 
 
-def _uncertainty_note(rig: Rig, key: str, *, cause: str, remedy: str) -> Iterator[str]:
+def _uncertainty_note(
+    costs: ToleranceCosts | None, key: str, *, cause: str, remedy: str
+) -> Iterator[str]:
     """Yield the contrast that remains with one uncertainty of a rig."""
-    with contextlib.suppress(InputError):  # the plate is too small for two fingers
-        cost = uncertainty_cost(rig, key)
-        yield f"{cause} two vibrations keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB; {remedy}"
+    if costs is None or key not in costs.costs_db:
+        return
+    kept = costs.promised_db
+    exact = kept + costs.costs_db[key]
+    yield f"{cause} a finger keeps {kept:.1f} of {exact:.1f} dB of contrast; {remedy}"
 
 
 def _span_notes(rig: Rig) -> Iterator[str]:

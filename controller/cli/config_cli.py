@@ -79,6 +79,7 @@ def check(
         warnings.append(slow_kernels)
     lines = [f"{file}: {checked.line}"]
     lines += [f"warning: {warning}" for warning in warnings]
+    lines += checked.rows
     report = {"ok": True, "errors": [], "warnings": warnings, **checked.data}
     print_report(lines, report, as_json=as_json)
 

@@ -37,15 +37,16 @@ def show(
 ) -> None:
     """Show a table's levels, weak cells, contrast and origin."""
     from model.study.overview import find_overview, summarize
-    from model.study.promise_cost import tolerance_costs
+    from model.study.promise_cost import costs_of_tolerances
     from model.table.table_file import load_table
 
     table = load_table(table_file)
     with Stopwatch() as timed, progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
-        costs = tolerance_costs(table)
+        costs = costs_of_tolerances(table)
     cells = overview.cells
-    summary = summarize(table, overview) | {"tolerance_costs_db": costs}
+    costs_db = {} if costs is None else dict(costs.costs_db)
+    summary = summarize(table, overview) | {"tolerance_costs_db": costs_db}
     length, width, _ = summary["plate_m"]
     target = f"{0.25 * length:.3g},{0.25 * width:.3g}"
     quiet = f"{0.75 * length:.3g},{0.75 * width:.3g}"

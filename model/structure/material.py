@@ -197,7 +197,7 @@ _TYPICAL_THICKNESS = 6.4e-3  # m
 
 
 def _known(row: dict[str, Any], wood: Mapping[str, Any]) -> KnownMaterial:
-    """Build a material from its row in materials.toml; wood: fields of all kinds of wood."""
+    """Build a material from its row in materials.toml; wood: defaults of all kinds of wood."""
     name = row.pop("name")
     by_thickness = _BY_THICKNESS.get(name)
     by_frequency: tuple[tuple[float, float, float], ...] = ()
@@ -212,7 +212,7 @@ def _known(row: dict[str, Any], wood: Mapping[str, Any]) -> KnownMaterial:
         rows = row.pop("by_frequency", ())
         by_frequency = tuple((frequency, modulus / E, loss) for frequency, modulus, loss in rows)
     if row.pop("wood", False):
-        row |= wood
+        row = {**wood, **row}
     return KnownMaterial(material, by_frequency=by_frequency, by_thickness=by_thickness, **row)
 
 

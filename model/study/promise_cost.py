@@ -5,7 +5,7 @@ each tolerance of a rig. The contrasts are computed at a few positions, in a sec
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ from model.drive_modes import UNRESTRICTED
 from model.ensemble.draws import ClockErrors
 from model.errors import InputError
 from model.finger import FINGERTIP_RADIUS
-from model.rig.rig import BOUNDS, Rig
+from model.rig.rig import BOUNDS, Rig, Uncertainty
 from model.study.contact_sets import random_contacts
 from model.study.weak_cells import contrasts_of
 from model.table.table import PAPER_GRID, LocalizationTable
@@ -54,46 +54,97 @@ def clock_cost(rig: Rig, errors: Mapping[str, float]) -> PromiseCost:
     return _cost(exact, _promised_db(with_errors))
 
 
-def uncertainty_cost(rig: Rig, key: str) -> PromiseCost:
-    """Compute the contrast of two contents with a key of the uncertainty set to 0, and unchanged.
+@dataclass(frozen=True)
+class ToleranceCosts:
+    """Promised contrast of a finger to another, and the cost of each tolerance of a rig."""
 
-    Median over positions; raises the errors of `clock_cost`.
+    promised_db: float
+    """Mean over random positions."""
+
+    costs_db: Mapping[str, float]
+    """Increase of this promise if a key of `uncertainty` is exact, by key, the largest first."""
+
+
+def uncertainty_costs(rig: Rig) -> ToleranceCosts | None:
+    """Compute the costs of a rig's tolerances up to 250 Hz.
+
+    None if the plate is too small for two fingers, or reaches the level nowhere. Raises InputError
+    for a rig without a table.
     """
-    table = _coarse_table(rig)
-    without_key = replace(rig.uncertainty, **{key: 0.0})
-    exact_table = replace(table, uncertainty=without_key)
-    return _cost(_promised_db(exact_table), _promised_db(table))
+    return costs_of_tolerances(_coarse_table(rig))
 
 
-def tolerance_costs(table: LocalizationTable) -> dict[str, float]:
-    """Return how much each tolerance of the rig costs [dB], the most expensive first.
-
-    The cost of a key of `uncertainty` is the increase of the promised contrast with one quiet
-    finger if this tolerance is 0, averaged over random positions. Empty if the plate is too small
-    for two fingers, or reaches the level nowhere.
-    """
+def costs_of_tolerances(table: LocalizationTable) -> ToleranceCosts | None:
+    """Compute the costs of a table's tolerances; None as `uncertainty_costs`."""
     rng = np.random.default_rng(_SEED)
     questions = []
     with suppress(InputError):
         for _ in range(_QUESTIONS):
             target, quiet = random_contacts(rng, 2, table.plate, margin=FINGERTIP_RADIUS)
             questions.append(Placement((target,), (quiet,)))
-    promised = [contrasts_of(table, question) for question in questions]
+    promised_db = _promises_db(table, questions)
+    if np.isnan(promised_db).all():
+        return None
     costs = {}
     for key, (exact, _) in BOUNDS.items():
         if getattr(table.uncertainty, key) == exact:
             continue
         uncertainty = replace(table.uncertainty, **{key: exact})
         exact_table = replace(table, uncertainty=uncertainty)
-        gains = []
-        for question, kept in zip(questions, promised, strict=True):
-            without_error = contrasts_of(exact_table, question)
-            if kept is not None and without_error is not None:
-                gains.append(without_error[0] - kept[0])
-        if gains:
-            costs[key] = float(np.mean(gains))
+        gains = _promises_db(exact_table, questions) - promised_db
+        if not np.isnan(gains).all():
+            costs[key] = float(np.nanmean(gains))
     by_cost = sorted(costs.items(), key=lambda cost: cost[1], reverse=True)
-    return dict(by_cost)
+    return ToleranceCosts(float(np.nanmean(promised_db)), dict(by_cost))
+
+
+def _promises_db(table: LocalizationTable, questions: Sequence[Placement]) -> FloatArray:
+    """Return the promised contrast (questions,) [dB], NaN where the level is not reached."""
+    promises = []
+    for question in questions:
+        contrasts = contrasts_of(table, question)
+        promises.append(math.nan if contrasts is None else contrasts[0])
+    return np.array(promises)
+
+
+MEASUREMENTS = {
+    "gain": "era rig identify",
+    "phase_deg": "era rig identify",
+    "thickness": "era rig identify",
+    "modulus": "era rig identify",
+    "stiffness": "era rig identify",
+    "damping": "era rig identify",
+    "place": "era rig identify",
+    "supports": "era rig identify",
+    "mode_frequency": "era rig identify",
+    "mode_amplitude": "a modal test of the built part",
+    "field": "era rig identify with more sensors",
+    "level": "era rig identify at the level of use",
+    "harmonic": "distortion of the drives at full level",
+    "fingertip": "force or size of each contact",
+    "weather": "era rig identify in each season",
+    "foreign_mass": "permanent loads, to list under masses",
+}
+"""Measurement that reduces each tolerance most."""
+
+_LEAST_COST = 0.05  # dB of a tolerance that is listed
+
+
+def cost_rows(uncertainty: Uncertainty, costs: ToleranceCosts) -> list[str]:
+    """Return the table of costs, and the measurement that gains most, as lines."""
+    listed = {key: cost for key, cost in costs.costs_db.items() if cost >= _LEAST_COST}
+    if not listed:
+        return []
+    rows = [
+        f"a finger is promised {costs.promised_db:.1f} dB of contrast to another; more if exact:"
+    ]
+    for key, cost in listed.items():
+        exact = Uncertainty.none()
+        tolerance = str(replace(exact, **{key: getattr(uncertainty, key)}))
+        rows.append(f"    {tolerance:24s} {cost:5.1f} dB  {MEASUREMENTS.get(key, '')}".rstrip())
+    key, cost = next(iter(listed.items()))
+    rows.append(f"{key} costs most, {cost:.1f} dB: measure it ({MEASUREMENTS[key]})")
+    return rows
 
 
 def _coarse_table(rig: Rig) -> LocalizationTable:

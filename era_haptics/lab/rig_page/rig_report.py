@@ -20,7 +20,7 @@ from model.rig.rig import Rig
 from model.structure.statics import center_of_mass
 from model.study.contrast_maps import ContrastMap, map_contrast
 from model.study.overview import find_overview, summarize
-from model.study.promise_cost import tolerance_costs
+from model.study.promise_cost import costs_of_tolerances
 from model.table.table import LocalizationTable
 from model.table.table_file import cached_table
 from model.vibration import damped_modes
@@ -74,7 +74,7 @@ def report_of(
     positions = [(u * rig.plate.length, v * rig.plate.width) for u, v in FINGERS]
     maps = _contrast_maps(table, positions[1:])
     progress(4, _STEPS)
-    costs = tolerance_costs(table)
+    costs = costs_of_tolerances(table)
     progress(5, _STEPS)
     balance = checked.data.get("balance")
     center = center_of_mass(rig.plate) if balance is None else balance["centre_of_mass_m"]
@@ -89,7 +89,7 @@ def report_of(
         summary=summary,
         answer=_three_vibrations(table, positions),
         maps=maps,
-        costs=costs,
+        costs={} if costs is None else costs.costs_db,
     )
     progress(_STEPS, _STEPS)
     return report

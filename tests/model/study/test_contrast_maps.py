@@ -33,7 +33,13 @@ from model.finger import Grid
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study.contact_sets import random_contacts
-from model.study.promise_cost import PromiseCost, clock_cost, tolerance_costs
+from model.study.promise_cost import (
+    PromiseCost,
+    clock_cost,
+    cost_rows,
+    costs_of_tolerances,
+    uncertainty_costs,
+)
 from model.study.table_export import export_csv, export_mat
 from model.study.weak_cells import (
     WeakCells,
@@ -80,12 +86,30 @@ def test_only_uncertain_keys_cost_contrast() -> None:
     costs = []
     for stiffness in (0.0, 0.1, 0.2):
         uncertainty = replace(Uncertainty.none(), stiffness=stiffness)
-        costs.append(tolerance_costs(replace(smooth_table(), uncertainty=uncertainty)))
+        table = replace(smooth_table(), uncertainty=uncertainty)
+        costs.append(costs_of_tolerances(table))
 
     exact, less, more = costs
-    assert exact == {}
-    assert list(less) == ["stiffness"]
-    assert 0 < less["stiffness"] < more["stiffness"]
+    assert exact.costs_db == {}
+    assert list(less.costs_db) == ["stiffness"]
+    assert 0 < less.costs_db["stiffness"] < more.costs_db["stiffness"]
+    without = less.promised_db + less.costs_db["stiffness"]
+    assert without == pytest.approx(exact.promised_db)
+
+
+def test_check_lists_costs_of_tolerances_and_what_to_measure() -> None:
+    """Damping counts as a factor, of 1 if exact; the costs are those of the table up to 250 Hz."""
+    rig = replace(smooth_rig(), uncertainty=replace(Uncertainty.none(), damping=1.5, gain=0.1))
+    costs = uncertainty_costs(rig)
+
+    first, *rows, last = cost_rows(rig.uncertainty, costs)
+
+    assert f"{costs.promised_db:.1f} dB" in first
+    assert set(costs.costs_db) == {"damping", "gain"}
+    assert all(cost > 0 for cost in costs.costs_db.values())
+    assert [row.split()[0] for row in rows] == list(costs.costs_db)
+    assert last.startswith(f"{next(iter(costs.costs_db))} costs most, ")
+    assert last.endswith("(era rig identify)")
 
 
 RIG = """

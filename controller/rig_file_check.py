@@ -72,7 +72,7 @@ def check_rig(document: Document) -> CheckedFile:
         raise ConfigError(document.source, problems)
     clock_line, clock_warnings, clock_data = clock_costs(rig, urls)
     summary = summary_line(rig)
-    data = {}
+    data: dict[str, Any] = {}
     balance = _balance(rig)
     if balance is not None:
         data["balance"] = balance.as_json()

@@ -66,7 +66,7 @@ def added_mass(
         jumps_y, slopes_y = _jumps(sides[1], highest, parity[1])
         by_jump = integrals.between(slopes_x, jumps_y) + integrals.between(jumps_x, slopes_y)
         moved = np.kron(jumps_x @ of_x.T, jumps_y @ of_y.T)
-        mass = moved.T @ np.linalg.solve(by_jump / 2, moved)
+        mass = np.asarray(moved.T @ np.linalg.solve(by_jump / 2, moved), dtype=float)
     symmetric = AIR_DENSITY * (mass + mass.T) / 2
     symmetric.setflags(write=False)  # cached, and so shared
     return np.asarray(symmetric)

@@ -47,17 +47,20 @@ def share_kept(table: LocalizationTable, level: float) -> float:
                 gains[number] = (1 + SIZE * decades) * turn
         changed = replace(plates, gain=plates.gain * gains)
         _, contrast = felt_on(table, placed, excitation, changed)
+        assert contrast is not None
         promised = best.fingers[0].promised_contrast_db
         kept.append(20 * np.log10(contrast) >= promised)
     return float(np.mean(kept))
 
 
-def test_promises_hold_if_they_count_the_change_of_gains_with_level(table):
+def test_promises_hold_if_they_count_the_change_of_gains_with_level(
+    table: LocalizationTable,
+) -> None:
     """On 86 % of plates at least, and not if they ignore it."""
     assert share_kept(table, SIZE) >= 0.86 > share_kept(table, 0.0)
 
 
-def test_drawn_gains_widen_with_the_change_by_level():
+def test_drawn_gains_widen_with_the_change_by_level() -> None:
     """By an eighth of the change for each ERA, which add as amplitudes: a quarter for four."""
     known = replace(Uncertainty.none(), level=SIZE)
 

@@ -20,7 +20,7 @@ CLASSES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 @pytest.mark.parametrize(
     ("ratio", "coefficient"), [(1.0, 0.579), (1.25, 0.642), (1.59, 0.704), (2.0, 0.757), (4, 0.872)]
 )
-def test_open_plate_carries_the_published_added_mass(ratio, coefficient):
+def test_open_plate_carries_the_published_added_mass(ratio: float, coefficient: float) -> None:
     """Mass of water around rectangular plates, DNV-RP-C205, table of added mass coefficients.
 
     Relative to rho pi / 4 a² b, for the shorter side a.
@@ -33,7 +33,7 @@ def test_open_plate_carries_the_published_added_mass(ratio, coefficient):
     assert mass == pytest.approx(expected, rel=0.015)
 
 
-def test_flush_square_carries_the_mass_of_rayleighs_integral():
+def test_flush_square_carries_the_mass_of_rayleighs_integral() -> None:
     """The mean of 1 / r over a unit square is 4 ln(1 + sqrt 2) - 4 (sqrt 2 - 1) / 3."""
     side = 0.2
 
@@ -83,11 +83,11 @@ def jump_by_vortex_rings(deflection: FloatArray, counts: tuple[int, int]) -> Flo
         for sign_y in (1, -1):
             u, v = dx + sign_x * half[0], dy + sign_y * half[1]
             induced += (sign_x * sign_y * np.hypot(u, v) / (u * v)).reshape(induced.shape)
-    return np.linalg.solve(induced / (4 * np.pi), deflection)
+    return np.asarray(np.linalg.solve(induced / (4 * np.pi), deflection), dtype=float)
 
 
 @pytest.mark.parametrize("parity", CLASSES)
-def test_open_air_of_bending_equals_vortex_rings(parity):
+def test_open_air_of_bending_equals_vortex_rings(parity: tuple[int, int]) -> None:
     """A second method for the same flow, extrapolated to small panels; to 1 %."""
     mass = mass_of_bending(SurroundingAir.BOTH, parity)
 
@@ -104,7 +104,7 @@ def test_open_air_of_bending_equals_vortex_rings(parity):
 
 
 @pytest.mark.parametrize("parity", CLASSES)
-def test_air_in_front_of_bending_equals_a_sum_over_panels(parity):
+def test_air_in_front_of_bending_equals_a_sum_over_panels(parity: tuple[int, int]) -> None:
     """Rayleigh's integral over square panels; to 1 %.
 
     The integral of 1 / r over a square lattice exceeds the sum at the other points by -4 zeta(1/2)
@@ -122,7 +122,7 @@ def test_air_in_front_of_bending_equals_a_sum_over_panels(parity):
     assert mass_of_bending(SurroundingAir.FRONT, parity) == pytest.approx(expected, rel=0.01)
 
 
-def test_short_waves_carry_rho_over_their_wavenumber_on_each_side():
+def test_short_waves_carry_rho_over_their_wavenumber_on_each_side() -> None:
     """Both kinds of air tend to the mass of an infinite plate, to 7 % at eight waves per side."""
     degree, side = 40, 0.3
     mass = added_mass(SurroundingAir.BOTH, (side, side), (degree, degree), (1, 1))
@@ -138,7 +138,7 @@ def test_short_waves_carry_rho_over_their_wavenumber_on_each_side():
         assert both_sides == pytest.approx(2 * AIR_DENSITY / wavenumber, rel=0.07)
 
 
-def test_air_lowers_natural_frequencies_by_its_share_of_the_mass():
+def test_air_lowers_natural_frequencies_by_its_share_of_the_mass() -> None:
     """A rigid plate heaves on soft springs with the mass of its air; all modes become lower."""
     rig = make_paper_rig(12, 9)
     rig = replace(rig, mesh=mesh_of("auto", rig.plate, frequency_max=500.0))

@@ -121,6 +121,8 @@ MEASUREMENTS = {
     "field": "era rig identify with more sensors",
     "level": "era rig identify at the level of use",
     "harmonic": "distortion of the drives at full level",
+    "touch_position": "calibration of the touch panel",
+    "common_gain": "era rig identify",
     "fingertip": "force or size of each contact",
     "weather": "era rig identify in each season",
     "foreign_mass": "permanent loads, to list under masses",

@@ -91,6 +91,7 @@ def page_text(report: RigReport) -> str:
         scale=escape(scale_in_words(report.rig.threshold)),
         advice=escape(page_sections.advice(report)),
         findings=html_of(page_sections.findings(report)),
+        listed=page_sections.listed_modes(report),
         modes=html_of(table_rows(page_sections.modes(report))),
         amplifiers=escape(page_sections.amplifiers(report)),
         wiring=html_of(table_rows(page_sections.wiring(report))),

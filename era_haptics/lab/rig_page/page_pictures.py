@@ -212,40 +212,41 @@ def _draw_plate(axes: Axes, report: RigReport) -> None:
 
 def levels_picture(report: RigReport, levels: FloatArray) -> Figure:
     """Draw reachable levels (f, p) [dB SL] at positions over frequency, with limits and modes."""
-    frequencies = report.table.frequencies
     low, high = report.rig.limits.frequency_min, report.rig.limits.frequency_max
+    start = max(low - 0.12 * (high - low), 0)
+    end = high + 0.16 * (high - low)  # leaves room for the names of the curves
     figure = Figure(figsize=(_WIDTH, 2.4), layout="constrained")
     axes = figure.subplots()
-    worst, median, best = np.percentile(levels, [0, 50, 100], axis=1)
-    axes.fill_between(frequencies, worst, best, color=_BAND, lw=0)
-    for curve, width, words in (
-        (best, 0.6, "best"),
-        (median, 1.8, "median"),
-        (worst, 0.9, "worst"),
-    ):
-        axes.plot(frequencies, curve, color=_CURVE, lw=width)
-        axes.annotate(
-            f"{words} position",
-            (frequencies[-1], curve[-1]),
-            (4, {"best": 4, "worst": -4}.get(words, 0)),
-            textcoords="offset points",
-            va="center",
-            color=_CURVE,
-        )
-    end = high + 0.16 * (high - low)
-    start = max(low - 0.12 * (high - low), 0)
+    _draw_levels(axes, report.table.frequencies, levels)
     for left, right in ((start, low), (high, end)):
         axes.axvspan(left, right, fc=_FILL, ec="none", zorder=0)
     for level, words in ((FELT_DB_SL, "clearly felt"), (STRONG_DB_SL, "strong")):
         axes.axhline(level, color=_ACCENT, lw=0.9, ls=(0, (4, 3)))
         axes.text(start, level + 1.5, f" {words}: {level:g}", color=_ACCENT)
-    bottom = min(0.0, float(worst.min()))
+    bottom = min(0.0, float(levels.min()))
     natural = report.modes.natural_frequencies
     natural = natural[natural >= start]
     axes.plot(natural, np.full(len(natural), bottom), "|", c=_INK, ms=9, clip_on=False)
     axes.set(xlim=(start, end), xlabel="frequency / Hz", ylabel="level / dB SL")
     axes.set_ylim(bottom=bottom)
     return figure
+
+
+def _draw_levels(axes: Axes, frequencies: FloatArray, levels: FloatArray) -> None:
+    """Draw levels (f, p) [dB SL] over frequency at the best, the median and the worst position."""
+    worst, median, best = np.percentile(levels, [0, 50, 100], axis=1)
+    axes.fill_between(frequencies, worst, best, color=_BAND, lw=0)
+    curves = ((best, 0.6, 4, "best"), (median, 1.8, 0, "median"), (worst, 0.9, -4, "worst"))
+    for curve, line_width, rise, words in curves:
+        axes.plot(frequencies, curve, color=_CURVE, lw=line_width)
+        axes.annotate(
+            f"{words} position",
+            (frequencies[-1], curve[-1]),
+            (4, rise),
+            textcoords="offset points",
+            va="center",
+            color=_CURVE,
+        )
 
 
 def reachable_levels(report: RigReport) -> FloatArray:

@@ -99,6 +99,15 @@ def modes(report: RigReport) -> Iterator[tuple[str, str, str]]:
             yield f"{number}", f"{frequency:.1f} Hz", f"{100 * damping:.1f} %"
 
 
+def listed_modes(report: RigReport) -> str:
+    """Return the content of the table of modes in words."""
+    count = len(report.modes.natural_frequencies)
+    modes_in_words = (
+        "all modes" if count <= MAX_MODES else f"the first {MAX_MODES} of {count} modes"
+    )
+    return f"{modes_in_words} with their damping ratios"
+
+
 def advice(report: RigReport) -> str:
     """Return which tolerance to measure first."""
     if not report.costs:

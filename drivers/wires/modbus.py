@@ -70,7 +70,8 @@ class SilentPort(PortAbove):
     byte_time: of a byte on the line [s]; on_data: is called with received bytes. A frame always
     waits for the last frame of this port, and for others no longer than the longest one takes, so
     that noise does not delay a stop. A newer frame replaces an older waiting one, because its
-    request has timed out; broadcasts have no reply, and are all sent.
+    request has timed out, and goes no later than that one would have; broadcasts have no reply, and
+    are all sent.
     """
 
     def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
@@ -86,7 +87,12 @@ class SilentPort(PortAbove):
     def write(self, data: bytes) -> None:
         """Send a frame as soon as the line has been silent; raises LinkError."""
         latest = self._loop.time() + RTU_MAX * self._byte_time + self._silence
-        broadcasts = [entry for entry in self._waiting if entry[1].startswith(_TO_ALL)]
+        broadcasts = list[tuple[float, bytes]]()
+        for waiting_latest, frame in self._waiting:
+            if frame.startswith(_TO_ALL):
+                broadcasts.append((waiting_latest, frame))
+            else:  # repetitions of a request must not postpone it
+                latest = min(latest, waiting_latest)
         self._waiting = [*broadcasts, (latest, data)]
         self._send()
 

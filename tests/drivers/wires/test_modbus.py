@@ -13,6 +13,8 @@ import pytest
 from pymodbus.logging import Log
 
 from cases import in_turn, shortly
+from drivers.host.amplifier import Amplifier
+from drivers.host.line import Line
 from drivers.protocol.records import Values
 from drivers.wires import modbus_frames
 from drivers.wires.modbus import ModbusWire, SilentPort
@@ -29,6 +31,7 @@ from drivers.wires.modbus_frames import (
 from drivers.wires.wire import BrokenReply, Continuation, Nak, Reply
 from kit.clock import MemoryLine, in_virtual_time, unaltered
 from registry import threads
+from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
@@ -464,3 +467,28 @@ async def test_silent_port_sends_a_stop_despite_endless_noise() -> None:
 
     assert (line.times[0] - began) / CHARACTER == pytest.approx(259.5, abs=1)
     assert line.gaps == pytest.approx([9.5], abs=0.001)
+
+
+@in_virtual_time
+@pytest.mark.parametrize("baud", [19_200, 38_400, 57_600, 115_200])
+async def test_stop_is_sent_despite_endless_noise_whenever_it_is_repeated(baud: int) -> None:
+    """By hand: 256 characters of 11 bits and a silence after it is requested, at any baud rate.
+
+    Its repetitions, every 30 to 60 ms without a reply, do not postpone it.
+    """
+    wire = ModbusWire(baud, is_rtu=True, number=7)
+    line = Line(wire, "noisy line")
+    port = SilentPort(wire.silence, 11 / baud, line.received)
+    times: list[float] = []
+    port.below = Mock(is_blocked=False, write=lambda data: times.append(threads.now()))
+    line.open(port)
+    amplifier = Amplifier(line, 1, GuardLimits(10, 500, 1.0), name="a")
+    await asyncio.sleep(0.01)
+
+    began = threads.now()
+    stopping = asyncio.ensure_future(amplifier.stop())
+    while not stopping.done():
+        port.received(b"??")
+        await asyncio.sleep(0.0008)
+
+    assert times[0] - began <= 256 * 11 / baud + wire.silence + 0.001

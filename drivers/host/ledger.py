@@ -220,7 +220,13 @@ class Ledger:
                 self._rounding.achieved[command.channel, command.frequency] = played.frequency
 
     def note_ended(self, ramp: float, sent_at: float, now: float) -> None:
-        """Note that all layers end along a ramp [s], by a request sent at a time [s]."""
+        """Note that all layers end along a ramp [s], by a request sent at a time [s].
+
+        A set in doubt counts as played until then, so that the limits of duty and on-time hold.
+        """
+        doubt = self.doubt
+        if doubt is not None and doubt.sent_at - self._start_error < sent_at:
+            self.resolve(doubt.token, doubt.sent_at)
         self.doubt = None
         self.may_be_silent = set()
         self.lag = max(self.lag, now - sent_at)

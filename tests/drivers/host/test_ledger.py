@@ -46,10 +46,15 @@ class Account:
 
     def play(self, time: float, *layers: AmplifierLayer, delay: float = 0.0) -> LayerSet:
         """Admit a set, send it, and confirm that it plays after a delay [s]."""
+        admitted = self.send(time, *layers)
+        self.ledger.resolve(self.token, time + delay)
+        return admitted
+
+    def send(self, time: float, *layers: AmplifierLayer) -> LayerSet:
+        """Admit a set and send it, without a reply."""
         admitted = self.ledger.admit(layers, time)
         self.token += 1
         self.ledger.sent(self.token, admitted, time)
-        self.ledger.resolve(self.token, time + delay)
         return admitted[0]
 
     def refuse(self, time: float, *layers: AmplifierLayer) -> CommandRefused:
@@ -288,6 +293,17 @@ def test_duty_cycle_counts_vibration_within_ten_seconds() -> None:
     account.play(2.0, layer(0, tone(), valid_for=0.5))
 
     assert 740 <= account.admit(4.0, layer(0, tone())).valid_for <= 940
+
+
+def test_silence_counts_a_set_in_doubt_as_played() -> None:
+    """0.9 of one second in ten passes until a silence, although no reply confirmed the set."""
+    account = Account(duty=0.1)
+    lasting = layer(0, tone(), ramp=0.0)
+
+    account.send(0.0, lasting)
+    account.ledger.note_ended(ramp=0.0, sent_at=0.9, now=0.9)
+
+    assert 1 <= account.admit(5.0, lasting).valid_for <= 100
 
 
 def test_new_capabilities_do_not_restore_the_duty_cycle() -> None:

@@ -235,6 +235,7 @@ class Group:
     async def silence(self, ramp: float) -> float:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
 
+        A `play` in progress must be ended first (`abort_exchange`), or all amplifiers are stopped.
         Returns the time [s] at which the last request went out. Raises as `play`.
         """
         await self._exchange(partial(self.sets.silence, ramp))

@@ -269,6 +269,8 @@ class Line:
             return None
         self._attempt = None
         job = attempt.job
+        if job.result.done():  # its caller was cancelled: further parts would complete the set
+            return self._take_queued()
         job.go_on()
         if self.wire.confirms_parts:
             job.reach(job.part)
@@ -296,9 +298,8 @@ class Line:
             if job is None:
                 return None
             self._queue.take(job, now)
-            if not job.result.done():
+            if not job.result.done():  # its caller was not cancelled
                 return job
-            self._fail(job, Preempted(SUPERSEDED))  # its caller was cancelled
         return None
 
     def _start(self, job: Job) -> None:

@@ -27,6 +27,7 @@ from tests.drivers.host.group_on_lines import (
     late,
     losing,
     lost,
+    of_parts,
     on_wires,
     refuse,
     report,
@@ -442,3 +443,18 @@ async def test_cancelled_request_is_an_outcome_and_a_cancelled_caller_is_not(
 
     assert [type(result) for result in results] == [asyncio.CancelledError] * request_count
     assert waiting.cancelled()
+
+
+@on_wires("serial", "rtu", "can")
+async def test_set_whose_caller_is_cancelled_does_not_play(wire: str) -> None:
+    """Its parts that were not sent yet are dropped, so that the amplifier never has all of it."""
+    rig = await connect("a", wire=wire, baud=115_200 if wire == "serial" else 0)
+    playing = await begin(rig.apply(*of_parts(3)))
+    await asyncio.sleep(0)
+
+    playing.cancel()
+    await asyncio.wait({playing})
+    await asyncio.sleep(0.1)
+
+    assert playing.cancelled()
+    assert rig.levels == {"a": SILENT}

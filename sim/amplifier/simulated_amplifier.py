@@ -376,6 +376,11 @@ class SimulatedAmplifier:
     def set_temperature(self, temperature: float, moment: float) -> None:
         """Set the temperature [°C], with its consequences."""
         self._heat = ThermalState(moment, temperature, self._heat.final)
+        self._obey_temperature(moment)
+
+    def _obey_temperature(self, moment: float) -> None:
+        """Derate or trip if the temperature is above a threshold already."""
+        temperature = self._heat.at(moment)
         if temperature > DERATE_ABOVE and not self.is_derated:
             self._handle_overtemperature(moment)
         if temperature > FAULT_ABOVE:
@@ -484,6 +489,7 @@ class SimulatedAmplifier:
         self.clock.shift(values["shift"])
         self.feed(now)
         self._enter(_ENABLED, now)
+        self._obey_temperature(now)
 
     def _clear(self, latch: int, following: str, now: float) -> None:
         """Clear a stop or a fault with this latch, if its cause is gone; raises Refusal."""

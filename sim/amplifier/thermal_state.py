@@ -26,10 +26,11 @@ class ThermalState:
         return self.final + (self.temperature - self.final) * decay
 
     def when(self, threshold: float) -> float:
-        """Time [s] at which a threshold [°C] is crossed; infinity for never."""
+        """Time [s] at which the temperature rises to a threshold [°C]; infinity for never."""
         excess_at_start = self.temperature - threshold
         excess_at_end = self.final - threshold
-        if excess_at_start * excess_at_end >= 0:
+        is_crossed = excess_at_start < 0 < excess_at_end
+        if not is_crossed:
             return math.inf
         ratio = (excess_at_start - excess_at_end) / -excess_at_end
         return self.since + TIME_CONSTANT * math.log(ratio)

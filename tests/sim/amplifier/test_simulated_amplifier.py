@@ -129,6 +129,27 @@ def test_heat_derates_and_then_trips() -> None:
     assert state_name(requests.ask(0.31, "Clear", latch=1)) == "SWITCH_ON_DISABLED"
 
 
+@pytest.mark.parametrize(
+    ("temperature", "state", "level"),
+    [(69.0, "OPERATION_ENABLED", 5000), (84.0, "OPERATION_ENABLED", 2500), (120.0, "FAULT", 0)],
+)
+def test_hot_amplifier_derates_or_trips_when_it_is_armed(
+    temperature: float, state: str, level: int
+) -> None:
+    """It obeys the thresholds of 70 and 85 degrees C before it cools, and not on the way down."""
+    requests = Requests()
+    requests.amplifier.set_temperature(temperature, 0.1)
+    requests.amplifier.restart(0.2)
+
+    requests.ask(0.3, "Arm", session=SESSION, watchdog=1000, shift=0)
+    if state == "OPERATION_ENABLED":
+        requests.play(0.4, 1, (0, 5000))
+
+    status = requests.status(0.6)
+    assert state_name(status) == state
+    assert status["levels"] == [level, 0]
+
+
 def test_open_interlock_trips_and_prevents_arming() -> None:
     """It is neither cleared nor armed until the interlock is closed."""
     requests = Requests()

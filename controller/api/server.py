@@ -428,11 +428,13 @@ class ApiServer:
         while clients:
             client = clients.popleft()
             self._waiting.pop(client, None)
-            if client.has_lines:
-                self._serve(client, client.next_line())
-            if client.has_lines:  # to the end of the queue
-                self._waiting[client] = None
-                clients.append(client)
+            try:
+                if client.has_lines:
+                    self._serve(client, client.next_line())
+            finally:  # after any failure: its next line may be a stop
+                if client.has_lines:  # to the end of the queue
+                    self._waiting[client] = None
+                    clients.append(client)
             client.close_if_finished()
             if time.perf_counter() >= end:
                 break
@@ -477,9 +479,11 @@ class ApiServer:
                 self._respond(client, call, result)
                 return
         except Exception as error:
-            if call.silences:
-                self._stop_all()
-            self._respond(client, call, error)
+            try:
+                if call.silences:
+                    self._stop_all()
+            finally:
+                self._respond(client, call, error)
             return
         task = asyncio.ensure_future(self._finish(client, call, result))
         client.pending.add(task)

@@ -56,7 +56,7 @@ def transients_figure(rig: Rig) -> Figure:
     answer = query(table, Placement((TARGET,), (QUIET,)))
     excitation = answer.layers[0].excitation
     plate = loaded_plate(table, [TARGET, QUIET])
-    shaper = Shaper(plate, gain_variance=rig.uncertainty.gain_variance)
+    shaper = Shaper(plate, gain_variance=rig.uncertainty.gain_variance(len(rig.eras)))
     onset = shaper.onset(excitation, targets=[TARGET], quiet=[QUIET])
     ending = shaper.ending(excitation, targets=[TARGET], quiet=[QUIET])
     ramp = f"{1000 * ONSET_RAMP:.0f} ms ramp"

@@ -253,7 +253,8 @@ def _expected_form(
         return _with_errors(certain_form, eras, gain_variance)
     form_by_era = np.stack([_summed(hats[..., era, None]) for era in range(eras)])
     errors = np.einsum("ea,ekl,eb->kalb", combinations.conj(), form_by_era, combinations)
-    return certain_form + np.float32(gain_variance) * errors.reshape(certain_form.shape)
+    by_errors = np.float32(gain_variance) * errors.reshape(certain_form.shape)
+    return np.asarray(certain_form + by_errors)
 
 
 def _summed(responses: _ComplexArray) -> _ComplexArray:

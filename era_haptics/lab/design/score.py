@@ -197,7 +197,7 @@ class Scorer:
             [nominal, by_damping, *by_thickness],
             independent,
             self._weights,
-            gain_variance=self._rig.uncertainty.gain_variance(len(eras)),
+            gain_variance=self._rig.uncertainty.gain_variance(len(chosen)),
             error_power=error_power,
         )
         mean_field = (nominal * self._weights[..., None]).sum(axis=2)

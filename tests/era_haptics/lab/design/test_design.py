@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,13 @@ from era_haptics.lab.design.problem import (
     candidates_of,
     contact_rule,
     everywhere,
-    layouts_of,
 )
-from era_haptics.lab.design.results import Design
 from era_haptics.lab.design.runner import Runner
 from kit.plates import exciter_rig_text, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
 from model.finger import FIVE_POINTS, fingertips_on
-from model.processes import on_cluster, on_processes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
@@ -72,36 +68,6 @@ COARSE = make_paper_rig(12, 9)
 THREE_SETS = tuple(anywhere(COARSE.plate).sets(3, seed=1))
 EDGE = area_of("edge", COARSE.plate), replace(anywhere(COARSE.plate), given=THREE_SETS)
 """ERAs along the edge, judged by three contact sets."""
-
-
-def figures_by(runner: Runner) -> bytes:
-    """Return all numbers of a design of ten layouts with four ERAs, two of them judged."""
-    design_problem = DesignProblem(COARSE, 4, *EDGE, seed=0)
-    layouts = {design_problem: layouts_of("random:10", design_problem)}
-    design: Design = rank_layouts(layouts, finalists=2, runner=runner)
-    rows = []
-    for layout in design.layouts:
-        contrast = layout.mean_db if layout.judged else 0
-        rows.append([*layout.found.positions.ravel(), layout.found.score_db, contrast])
-    return np.array(rows).tobytes()
-
-
-@pytest.mark.long
-def test_processes_and_a_cluster_find_the_same_to_the_bit() -> None:
-    """One process, two of this machine and two Dask workers."""
-    import dask  # takes a second
-    from distributed import LocalCluster
-
-    by_one = figures_by(Runner())
-    by_two = figures_by(Runner(machines=partial(on_processes, 2)))
-    with (
-        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
-    ):
-        by_cluster = figures_by(Runner(machines=partial(on_cluster, cluster.scheduler_address)))
-
-    assert by_two == by_one
-    assert by_cluster == by_one
 
 
 def test_layout_is_judged_with_the_eras_of_its_problem() -> None:

@@ -6,7 +6,12 @@ answer loses nothing, and a study without a person takes as long as its computat
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator, Mapping
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    asynccontextmanager,
+    contextmanager,
+)
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,6 +29,7 @@ from controller.play.reports import Observers
 from controller.process.log import LogThread
 from controller.sources.touch import Change, Contact
 from era_haptics.drive import expect_rig
+from model.errors import expect_instance
 from model.rig.rig import Rig
 from model.rig.rig_writing import save_rig
 from model.table.table_file import cached_table
@@ -73,10 +79,9 @@ class _Fingertips:
         placing.add_done_callback(self._placing.discard)
 
 
-@contextmanager
 def simulated_panel(
     rig: Rig, *, seed: int | None = None, layout: Mapping[str, Any] | None = None
-) -> Iterator[SimulatedPanel]:
+) -> AbstractContextManager[SimulatedPanel]:
     """Run a daemon of a rig over simulated amplifiers for the duration of a `with` block.
 
     - seed: of a plate within the rig's tolerances; None for the rig's own plate.
@@ -94,13 +99,24 @@ def simulated_panel(
         ...         own, other = panel.felt(played.start_s + 0.5, played.start_s + 0.9)
     """
     expect_rig(rig)
+    if seed is not None:
+        expect_instance(seed, int, what="seed", made_by="1, or None for the rig's own plate")
+    if layout is not None:
+        expect_instance(layout, Mapping, what="layout", made_by='{"elsewhere": None}')
+    return _running_panel(rig, seed, layout or _NOTHING_PLAYS)
+
+
+@contextmanager
+def _running_panel(
+    rig: Rig, seed: int | None, layout: Mapping[str, Any]
+) -> Iterator[SimulatedPanel]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="era-")))
         rig_file = folder / "panel.yaml"
         save_rig(rig, rig_file)
         loop = VirtualLoopRunner()
         stack.callback(loop.close)
-        serving = _served(rig, rig_file, seed, layout or _NOTHING_PLAYS)
+        serving = _served(rig, rig_file, seed, layout)
         async_client, plate = loop.run(_entered(serving))
         stack.push(lambda *error: loop.run(serving.__aexit__(*error)))
         yield SimulatedPanel(Client(async_client, loop), plate, loop)

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray, lattice
-from model.errors import InputError, is_whole
+from model.errors import InputError, is_whole, shown
 from model.structure.plate import Plate
 
 GAUSS_LEGENDRE = np.column_stack(np.polynomial.legendre.leggauss(8))
@@ -284,12 +284,16 @@ def highest_known(threshold: str = DEFAULT_THRESHOLD) -> float:
 
 def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> None:
     """Raise InputError for frequencies [Hz] at which a set of thresholds has no data."""
+    try:
+        frequencies = np.asarray(frequency, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"frequency must be numbers of hertz, got {shown(frequency)}") from None
     if threshold not in THRESHOLDS:
         raise InputError(f"threshold must be one of {', '.join(THRESHOLDS)}, got {threshold!r}")
     tabulated, _ = _tabulated(threshold)
     low, high = tabulated[0], tabulated[-1]
-    has_data = (low <= frequency) & (frequency <= high)
-    outside = np.asarray(frequency)[~has_data]  # NaN too
+    has_data = (low <= frequencies) & (frequencies <= high)
+    outside = frequencies[~has_data]  # NaN too
     if outside.size:
         raise InputError(
             f"frequency must be {low:g} to {high:g} Hz, where the thresholds {threshold} have "
@@ -302,6 +306,9 @@ def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
 
     threshold: name of the set. Interpolated in the logarithm of both. Raises InputError for
     frequencies without data.
+
+    Example:
+        >>> era.detection_threshold(np.array([60.0, 250.0]))
     """
     check_has_threshold(frequency, threshold)
     tabulated, accelerations = _tabulated(threshold)

@@ -68,6 +68,8 @@ accepts(
     duration=0.04,
 )
 accepts(era.measures, table=None, answer=ANSWER)
+accepts(era.detection_threshold, frequency=60.0, threshold="vibrotactile-probe")
+accepts(era.simulated_panel, rig=RIG, seed=1, layout={})
 accepts(
     era.contrast_map,
     table=None,

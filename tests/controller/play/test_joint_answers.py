@@ -316,13 +316,12 @@ def contrasts_on_plates(
     return np.array(contrasts)
 
 
-@pytest.mark.parametrize("rest", [(0.05, 0.04), (0.22, 0.04)])
-def test_promise_on_a_way_is_that_of_the_mean_power_there_on_exact_plates(rest: Position) -> None:
+def test_promise_on_a_way_is_that_of_the_mean_power_there_on_exact_plates() -> None:
     """A moving and a resting finger have their nominal contrasts, and promises on 90 % of plates.
 
     The promise is the 10th percentile over the stated tolerances.
     """
-    contacts = [moving_contact(1, MOVER, vx=0.2), moving_contact(2, rest)]
+    contacts = [moving_contact(1, MOVER, vx=0.2), moving_contact(2, (0.05, 0.04))]
     targets = [
         (contact, Target(contact.key, 14.0, content=str(contact.key.id))) for contact in contacts
     ]
@@ -340,7 +339,7 @@ def test_promise_on_a_way_is_that_of_the_mean_power_there_on_exact_plates(rest: 
     assert len(answer.layers) == 2
     sensations = answer.fingers
     predicted = [sensation.contrast_db for sensation in sensations]
-    np.testing.assert_allclose(predicted, nominal[:, 0], atol=0.8, err_msg="nominal contrast")
+    np.testing.assert_allclose(predicted, nominal[:, 0], atol=0.5, err_msg="nominal contrast")
     promises = np.array([sensation.promised_contrast_db for sensation in sensations])
     shares = (drawn >= promises[:, None]).mean(axis=1)
     np.testing.assert_allclose(shares, 0.9, atol=0.08, err_msg="share of plates")

@@ -5,25 +5,24 @@ both sides. Answers ignore the air, with a modulus that a fit has changed so tha
 frequencies agree on average, or count it.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.promise.cases import EXAMPLES, IDENTIFIED, LEVEL_DB_SL
-from benchmarks.promise.weather import contrasts_on
-from model.answer.plan import answer
-from model.answer.stimulus import Finger, Stimulus
+from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
+from benchmarks.promise.weather import contrasts_on, promised_and_kept
+from model.answer.answer import Answer
+from model.arrays import FloatArray, Point
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
 from model.structure.plate import Plate, SurroundingAir
-from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.vibration import natural_modes
 
-MARGIN = 0.02  # m; of fingers from the edge
 HIGHEST = 320.0  # Hz; of answers, and of the modes that a fit adjusts
 
 
@@ -66,20 +65,10 @@ def _table(rig: Rig) -> LocalizationTable:
 
 
 def _promised_and_kept(
-    table: LocalizationTable,
-    true: LocalizationTable,
-    sets: int,
-    plates: int,
+    table: LocalizationTable, true: LocalizationTable, sets: int, plates: int
 ) -> str:
-    promises, kept = [], []
-    for number in range(sets):
-        rng = np.random.default_rng([number, 77])
-        positions = random_contacts(rng, 2, table.plate, margin=MARGIN)
-        fingers = [Finger(at, Stimulus(LEVEL_DB_SL)) for at in positions]
-        best = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
+    def felt(rng: np.random.Generator, best: Answer, positions: Sequence[Point]) -> FloatArray:
         drawn = draw_plates(rng, true.uncertainty, count=plates, of=true, contact_count=2)
-        promised = np.array([finger.promised_contrast_db for finger in best.fingers], dtype=float)
-        felt = contrasts_on(true, best, positions, drawn)
-        promises.append(promised.min())
-        kept.append(felt >= promised[:, None])
-    return f"{np.median(promises):.1f} dB, {100 * np.mean(kept):.0f} %"
+        return contrasts_on(true, best, positions, drawn)
+
+    return promised_and_kept(table, sets, felt)

@@ -5,23 +5,21 @@ been identified at full level; a tenth of it changes every ERA's gain by 10 % an
 as hysteresis does, or a half of this. Answers ignore it, or count it by `uncertainty.level`.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.promise.cases import EXAMPLES, IDENTIFIED, LEVEL_DB_SL
-from benchmarks.promise.weather import contrasts_on
-from model.answer.plan import answer
-from model.answer.stimulus import Finger, Stimulus
-from model.arrays import ComplexArray
+from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
+from benchmarks.promise.weather import contrasts_on, promised_and_kept
+from model.answer.answer import Answer
+from model.arrays import ComplexArray, FloatArray, Point
 from model.rig.rig_file import load_rig
-from model.study.contact_sets import random_contacts
 from model.study.exact_plates import draw_plates
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.vibration import Excitation
 
-MARGIN = 0.02  # m; of fingers from the edge
 PHASE_DEG = 30.0
 """Change of the phase relative to that of the gain."""
 
@@ -47,22 +45,14 @@ def run(sets: int, plates: int) -> None:
 
 
 def _promised_and_kept(table: LocalizationTable, size: float, sets: int, plates: int) -> str:
-    promises, kept = [], []
-    for number in range(sets):
-        rng = np.random.default_rng([number, 77])
-        positions = random_contacts(rng, 2, table.plate, margin=MARGIN)
-        fingers = [Finger(at, Stimulus(LEVEL_DB_SL)) for at in positions]
-        best = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
+    def gains(excitation: Excitation) -> ComplexArray:
+        return _gains_at(table, excitation, size)
+
+    def felt(rng: np.random.Generator, best: Answer, positions: Sequence[Point]) -> FloatArray:
         drawn = draw_plates(rng, table.uncertainty, count=plates, of=table, contact_count=2)
+        return contrasts_on(table, best, positions, drawn, gains)
 
-        def gains(excitation: Excitation) -> ComplexArray:
-            return _gains_at(table, excitation, size)
-
-        promised = np.array([finger.promised_contrast_db for finger in best.fingers], dtype=float)
-        felt = contrasts_on(table, best, positions, drawn, gains)
-        promises.append(promised.min())
-        kept.append(felt >= promised[:, None])
-    return f"{np.median(promises):.1f} dB, {100 * np.mean(kept):.0f} %"
+    return promised_and_kept(table, sets, felt)
 
 
 def _gains_at(table: LocalizationTable, excitation: Excitation, size: float) -> ComplexArray:

@@ -16,7 +16,7 @@ from benchmarks.promise.cases import EXAMPLES, IDENTIFIED, LEVEL_DB_SL
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Placement, Stimulus
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.rig.rig_writing import change_rig
@@ -87,15 +87,31 @@ def run(sets: int, plates: int) -> None:
 
 
 def _promised_and_kept(table: LocalizationTable, material: Material, sets: int, plates: int) -> str:
+    def felt(rng: np.random.Generator, best: Answer, positions: Sequence[Point]) -> FloatArray:
+        drawn = draw_plates(rng, material.known, count=plates, of=table, contact_count=2)
+        return contrasts_on(table, best, positions, material.changed(drawn))
+
+    return promised_and_kept(table, sets, felt)
+
+
+def promised_and_kept(
+    table: LocalizationTable,
+    sets: int,
+    felt_on_plates: Callable[[np.random.Generator, Answer, Sequence[Point]], FloatArray],
+) -> str:
+    """Return the median promise of a table to the worse of two fingers, and the share kept.
+
+    felt_on_plates: contrasts [dB] (2, plates) of an answer for fingers at positions [m] on drawn
+    plates.
+    """
     promises, kept = [], []
     for number in range(sets):
         rng = np.random.default_rng([number, 77])
         positions = random_contacts(rng, 2, table.plate, margin=MARGIN)
         fingers = [Finger(at, Stimulus(LEVEL_DB_SL)) for at in positions]
         best = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
-        drawn = draw_plates(rng, material.known, count=plates, of=table, contact_count=2)
-        promised = np.array([each.promised_contrast_db for each in best.fingers], dtype=float)
-        felt = contrasts_on(table, best, positions, material.changed(drawn))
+        promised = np.array([finger.promised_contrast_db for finger in best.fingers], dtype=float)
+        felt = felt_on_plates(rng, best, positions)
         promises.append(promised.min())
         kept.append(felt >= promised[:, None])
     return f"{np.median(promises):.1f} dB, {100 * np.mean(kept):.0f} %"

@@ -282,7 +282,9 @@ def highest_known(threshold: str = DEFAULT_THRESHOLD) -> float:
     return float(_tabulated(threshold)[0][-1])
 
 
-def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> None:
+def check_has_threshold(
+    frequency: float | Sequence[float] | FloatArray, threshold: str = DEFAULT_THRESHOLD
+) -> None:
     """Raise InputError for frequencies [Hz] at which a set of thresholds has no data."""
     try:
         frequencies = np.asarray(frequency, dtype=float)
@@ -301,14 +303,17 @@ def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
         )
 
 
-def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> FloatArray:
+def detection_threshold(
+    frequency: float | Sequence[float] | FloatArray, threshold: str = DEFAULT_THRESHOLD
+) -> FloatArray:
     """Return the peak acceleration [m/s²] that a fingertip just detects at frequencies [Hz].
 
     threshold: name of the set. Interpolated in the logarithm of both. Raises InputError for
     frequencies without data.
 
     Example:
-        >>> era.detection_threshold(np.array([60.0, 250.0]))
+        >>> era.detection_threshold([60.0, 250.0]).round(3).tolist()
+        [0.276, 0.247]
     """
     check_has_threshold(frequency, threshold)
     tabulated, accelerations = _tabulated(threshold)

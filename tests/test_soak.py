@@ -21,8 +21,6 @@ from soak_runs import (
     run_plan,
 )
 
-SOAK = Path(__file__).parent / "programs" / "soak.py"
-
 
 def digests() -> dict[str, str]:
     """The digest of a plan's trace, on a line and on a bus."""
@@ -45,7 +43,7 @@ def test_soak_trace_is_the_same_in_every_process() -> None:
         env={
             **os.environ,
             "PYTHONHASHSEED": "1",
-            "PYTHONPATH": os.pathsep.join((str(SOAK.parent), str(Path(__file__).parent))),
+            "PYTHONPATH": os.pathsep.join((*sys.path, str(Path(__file__).parent))),
         },
         capture_output=True,
         text=True,

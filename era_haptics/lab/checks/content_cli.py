@@ -28,9 +28,33 @@ if TYPE_CHECKING:
     from model.arrays import Point
     from model.table.table import LocalizationTable
 
+_FilesArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILE...",
+        help="Haptic files, folders of haptic files, or names of built-in contents.",
+    ),
+]
+_TableOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--table", metavar="TABLE", help="Table file, e.g. T.npz; default: the paper's plate."
+    ),
+]
+_LevelOption = Annotated[float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")]
+_ChannelOption = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Channel of a multi-channel file; default: 1.", min=1),
+]
+_PictureOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
+]
+
 _RATE = 48000  # Hz; every audio player supports it with 16 bits
 _MAX_SAMPLE = (1 << 15) - 1  # of 16 bits
 _FULL_SCALE = 20.0  # m/s²; contents at 20 dB SL reach 3 to 5
+_LEVEL_DB_SL = 20.0  # of intensity 1, unless another level is given
 _MAX_COLUMNS = 8  # of a picture
 _ROWS = 12  # of levels over time
 _REMEDY = "try another position (--at), another sharpness, slower rises or a lower --level"
@@ -51,10 +75,7 @@ def play(
         ),
     ] = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat until the finger lifts.")] = False,
-    channel: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Channel of a multi-channel file; default: 1.", min=1),
-    ] = None,
+    channel: _ChannelOption = None,
     simulate: Annotated[
         Path | None,
         typer.Option(metavar="TABLE", help="Simulate on the plate of this table instead."),
@@ -188,19 +209,8 @@ content_app = typer.Typer(no_args_is_help=True, help="Check content: AHAP, .hapt
 
 @content_app.command()
 def check(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="Haptic files, folders of haptic files, or names of built-in contents.",
-        ),
-    ],
-    table_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--table", metavar="TABLE", help="Table file, e.g. T.npz; default: the paper's plate."
-        ),
-    ] = None,
+    files: _FilesArgument,
+    table_file: _TableOption = None,
     at: Annotated[
         str | None,
         typer.Option(
@@ -209,21 +219,13 @@ def check(
         ),
     ] = None,
     quiet: QuietOption = None,
-    level: Annotated[
-        float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
-    ] = 20.0,
-    channel: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Channel of a multi-channel file; default: 1.", min=1),
-    ] = None,
+    level: _LevelOption = _LEVEL_DB_SL,
+    channel: _ChannelOption = None,
     least: Annotated[
         float,
         typer.Option(metavar="SHARE", help="Minimum kept fraction of the level.", min=0, max=1),
     ] = 0.8,
-    picture: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
-    ] = None,
+    picture: _PictureOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate how haptic files feel at a finger.
@@ -260,30 +262,14 @@ def check(
 
 @content_app.command()
 def compare(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="Haptic files, folders of haptic files, or names of built-in contents.",
-        ),
-    ],
-    table_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--table", metavar="TABLE", help="Table file, e.g. T.npz; default: the paper's plate."
-        ),
-    ] = None,
+    files: _FilesArgument,
+    table_file: _TableOption = None,
     at: Annotated[
         str | None,
         typer.Option(metavar="X,Y", help="Position of the finger in meters; default: off center."),
     ] = None,
-    level: Annotated[
-        float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
-    ] = 20.0,
-    picture: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
-    ] = None,
+    level: _LevelOption = _LEVEL_DB_SL,
+    picture: _PictureOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare how haptic files feel at the same position.

@@ -20,7 +20,6 @@ from model.rig.rig import Rig
 from model.structure.statics import center_of_mass
 from model.study.contrast_maps import ContrastMap, map_contrast
 from model.study.overview import find_overview, summarize
-from model.study.promise_cost import costs_of_tolerances
 from model.table.table import LocalizationTable
 from model.table.table_file import cached_table
 from model.vibration import damped_modes
@@ -29,7 +28,7 @@ FINGERS = (0.3, 0.35), (0.8, 0.6), (0.45, 0.85)
 """Positions of the example's fingers, as fractions of the plate's length and width."""
 
 _MAP_CELLS = 400
-_STEPS = 6
+_STEPS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +53,8 @@ class RigReport:
     maps: Sequence[ContrastMap]
     """Contrast of a finger anywhere to one and to two other fingers; empty for small plates."""
     costs: Mapping[str, float]
-    """Contrast [dB] that each tolerance costs, the most expensive first."""
+    """Contrast [dB] that each tolerance costs, as `era config check` prints it, the most expensive
+    first."""
 
 
 def report_of(
@@ -74,8 +74,6 @@ def report_of(
     positions = [(u * rig.plate.length, v * rig.plate.width) for u, v in FINGERS]
     maps = _contrast_maps(table, positions[1:])
     progress(4, _STEPS)
-    costs = costs_of_tolerances(table)
-    progress(5, _STEPS)
     balance = checked.data.get("balance")
     center = center_of_mass(rig.plate) if balance is None else balance["centre_of_mass_m"]
     report = RigReport(
@@ -89,7 +87,7 @@ def report_of(
         summary=summary,
         answer=_three_vibrations(table, positions),
         maps=maps,
-        costs={} if costs is None else costs.costs_db,
+        costs=checked.data.get("tolerance_costs_db", {}),
     )
     progress(_STEPS, _STEPS)
     return report

@@ -9,6 +9,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -27,6 +29,17 @@ BRIGHTEST_DB_SL = 30.0
 
 _GRAY = 0.62
 _RADIUS = 100 * FINGERTIP_RADIUS  # cm
+_LABEL_GAP = 8  # pt; from a finger's edge to its label
+_LABEL_PADDING = 4.0  # pixels; of a label's background
+_LABEL_PASSES = 3  # a moved label can cover another one
+_OUTSIDE_WEIGHT = 4.0  # text off the plate is cut
+_SIDES = {
+    "below": (0, -1, "center", "top"),
+    "above": (0, 1, "center", "bottom"),
+    "right": (1, 0, "left", "center"),
+    "left": (-1, 0, "right", "center"),
+}
+"""Direction along x and y, horizontal and vertical alignment of a label on a side of a finger."""
 _MIN_PATCH_SHARE = 0.015  # of the plate; smaller patches have no label
 
 
@@ -52,8 +65,7 @@ def contents_figure(
     main.set_title(
         "Color: a finger feels its own content. Gray: contents mix.", fontsize=TITLE_TEXT
     )
-    for finger in fingers:
-        _label_finger(main, finger, contents)
+    labels = [_label_finger(main, finger, contents) for finger in fingers]
     _label_patches(main, table, levels, contents, fingers)
     for number, layer in enumerate(contents):
         axes = panels[f"{number}"]
@@ -66,6 +78,8 @@ def contents_figure(
         "threshold. Squares: ERAs.",
         fontsize=SMALL_TEXT,
     )
+    figure.draw_without_rendering()  # computes the layout, and with it the extents of labels
+    _separate(labels, main)
     return figure
 
 
@@ -193,8 +207,44 @@ def _centimeters(finger: Sensation) -> tuple[float, float]:
     return 100 * x, 100 * y
 
 
-def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
-    """Write verdict, level and contrast next to a finger, toward the middle of the plate."""
+class _FingerLabel(Annotation):
+    """Verdict, level and contrast next to a finger, toward the middle of the plate."""
+
+    def __init__(self, axes: Axes, finger: Sensation, lines: Sequence[str]) -> None:
+        self.finger_position = _centimeters(finger)
+        super().__init__(
+            "\n".join(lines),
+            self.finger_position,
+            xytext=(0, 0),
+            textcoords="offset points",
+            fontsize=SMALL_TEXT,
+            color=_color_of(finger),
+            bbox={"fc": "black", "ec": "none", "alpha": 0.75, "boxstyle": "round"},
+        )
+        is_high = self.finger_position[1] > sum(axes.get_ylim()) / 2
+        self.place("below" if is_high else "above")
+
+    def place(self, side: str) -> None:
+        """Move the label to a side of the finger."""
+        x, y = self.finger_position
+        right, up, horizontal, vertical = _SIDES[side]
+        self.xy = x + right * _RADIUS, y + up * _RADIUS
+        self.set_position((right * _LABEL_GAP, up * _LABEL_GAP))
+        self.set(horizontalalignment=horizontal, verticalalignment=vertical)
+
+    def extent(self) -> Bbox:
+        """Return the label's extent with its background, in pixels."""
+        return self.get_window_extent().padded(_LABEL_PADDING)
+
+    def finger_extent(self, axes: Axes) -> Bbox:
+        """Return the extent of the label's finger, in pixels."""
+        center = np.array(self.finger_position)
+        corners = axes.transData.transform([center - _RADIUS, center + _RADIUS])
+        return Bbox(corners)
+
+
+def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> _FingerLabel:
+    """Write verdict, level and contrast next to a finger."""
     words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
     lines = [str(words)]
     if finger.layer is not None:
@@ -203,19 +253,40 @@ def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> N
         for reference, level in levels.items():
             if level is not None and math.isfinite(level):
                 lines.append(f"{level:.0f} dB {reference}")
-    x, y = _centimeters(finger)
-    is_high = y > sum(axes.get_ylim()) / 2
-    axes.annotate(
-        "\n".join(lines),
-        (x, y - _RADIUS if is_high else y + _RADIUS),
-        xytext=(0, -8 if is_high else 8),
-        textcoords="offset points",
-        ha="center",
-        va="top" if is_high else "bottom",
-        fontsize=SMALL_TEXT,
-        color=_color_of(finger),
-        bbox={"fc": "black", "ec": "none", "alpha": 0.75, "boxstyle": "round"},
-    )
+    label = _FingerLabel(axes, finger, lines)
+    axes.add_artist(label)
+    return label
+
+
+def _separate(labels: Sequence[_FingerLabel], axes: Axes) -> None:
+    """Move labels that cover other labels or fingers to the sides with most room."""
+    plate = Bbox(axes.bbox.get_points()).padded(0, _LABEL_GAP)
+    for _ in range(_LABEL_PASSES):
+        for label in labels:
+            others = [other for other in labels if other is not label]
+            obstacles = [other.extent() for other in others]
+            obstacles += [other.finger_extent(axes) for other in others]
+            if not label.extent().count_overlaps(obstacles):
+                continue
+            covered_areas = []
+            for side in _SIDES:
+                label.place(side)
+                covered_areas.append(_covered_area(label.extent(), obstacles, plate))
+            least = covered_areas.index(min(covered_areas))
+            label.place([*_SIDES][least])
+
+
+def _covered_area(extent: Bbox, obstacles: Sequence[Bbox], plate: Bbox) -> float:
+    """Return the area of obstacles that an extent covers; area off the plate counts more."""
+    covered = [_common_area(extent, obstacle) for obstacle in obstacles]
+    outside = extent.width * extent.height - _common_area(extent, plate)
+    return sum(covered) + _OUTSIDE_WEIGHT * outside
+
+
+def _common_area(extent: Bbox, other: Bbox) -> float:
+    """Return the area of the intersection of two boxes, 0 without one."""
+    common = Bbox.intersection(extent, other)
+    return 0.0 if common is None else float(common.width * common.height)
 
 
 def _color_of(finger: Sensation) -> str:

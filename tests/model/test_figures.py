@@ -1,5 +1,6 @@
 """Figures of the paper, pictures of tables, and full-scale templates."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -8,15 +9,22 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.text import Annotation
 from paper_figures import PaperFigure, paper_figures
 from tables import tables
 
 from era_haptics.command import run_era
 from kit.plates import make_paper_rig, small_table, write_rig
+from model.answer.plan import answer
+from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray
+from model.fem import Mesh
 from model.figures.answers import answer_figure
+from model.figures.contents import contents_figure
 from model.figures.table_pictures import levels_figure
+from model.finger import Grid
 from model.rig.rig import Rig
+from model.table.table_file import TableProblem, solve_table
 
 # Templates
 
@@ -175,3 +183,27 @@ def test_figure_of_no_answer_has_only_words() -> None:
     figure = answer_figure(replace(table, eras=eras))
 
     assert figure.axes == []
+
+
+def test_labels_of_fingers_on_a_long_plate_do_not_overlap() -> None:
+    """Three fingers on a plate of 4:1, where labels toward the middle overlap."""
+    rig = make_paper_rig(12, 4)
+    plate = replace(rig.plate, width=rig.plate.length / 4)
+    eras = tuple(replace(era, y=min(era.y, plate.width)) for era in rig.eras)
+    frequencies = np.arange(40.0, 500, 20)
+    mesh = Mesh(12, 4, plate.length, plate.width)
+    long_rig = replace(rig, plate=plate, eras=eras, mesh=mesh)
+    problem = TableProblem(long_rig, frequencies, Grid(8, 2))
+    table = solve_table(problem, drive_mode="phased", is_estimated=False)
+    shares = [(0.3, 0.3), (0.8, 0.6), (0.4, 0.8)]
+    fingers = [Finger((u * plate.length, v * plate.width), Stimulus()) for u, v in shares]
+    answered = answer(table, fingers, min_contrast_db=-math.inf)
+
+    figure = contents_figure(table, answered.layers, answered.promised_fingers)
+
+    figure.draw_without_rendering()
+    labels = [text for text in figure.axes[0].get_children() if isinstance(text, Annotation)]
+    extents = [label.get_bbox_patch().get_window_extent() for label in labels]
+    assert len(extents) == 3
+    for number, extent in enumerate(extents):
+        assert not extent.count_overlaps(extents[number + 1 :])

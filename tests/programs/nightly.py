@@ -8,17 +8,21 @@ output of a target is in out/nightly/TARGET.log. `--report` copies the rows to t
 
 A failed target does not end the run. A target that takes more than its hours is ended with all its
 processes. Targets that have not begun when the hours of the run are up count as failed, too.
+
+A target that is run again by itself replaces its own row in the documentation. So each row names
+its date and commit.
 """
 
 import argparse
 import contextlib
 import os
 import platform
+import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -91,31 +95,45 @@ def _end_all_of(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def table(outcomes: Sequence[Outcome], folder: Path) -> str:
-    """Return the results as a sentence and a Markdown table."""
+def commit_of(folder: Path) -> str:
+    """Return the short name of the commit that a folder has checked out."""
     command = ["git", "describe", "--always", "--dirty"]
-    commit = subprocess.run(command, cwd=folder, capture_output=True, text=True).stdout.strip()
-    minutes = sum(outcome.seconds for outcome in outcomes) / 60
-    passed = sum(outcome.is_passed for outcome in outcomes)
+    run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    return run.stdout.strip() or "unknown"
+
+
+def row(outcome: Outcome, commit: str) -> str:
+    """Return the result of a target as a row of the table."""
+    minutes = f"{outcome.seconds / 60:.1f}"
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    last_line = outcome.last_line[:_LAST_LINE_WIDTH].replace("|", "\\|")
+    cells = (f"`{outcome.target}`", outcome.result, minutes, today, commit, last_line)
+    return f"| {' | '.join(cells)} |"
+
+
+def rows_by_target(page_of_rows: str) -> dict[str, str]:
+    """Return the rows of a page's table by the names of their targets, in the page's order."""
+    matches = re.finditer(r"^\| `([^`]+)` \|.*$", page_of_rows, re.MULTILINE)
+    return {match[1]: match[0] for match in matches}
+
+
+def table(rows: Iterable[str]) -> str:
+    """Return rows as a table, below a sentence that names the machine."""
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
     lines = [
-        f"`make nightly` of {datetime.now(UTC):%Y-%m-%d}, commit {commit or 'unknown'}: "
-        f"{passed} of {len(outcomes)} targets passed in {minutes:.0f} minutes "
-        f"(Python {platform.python_version()}, {machine}).",
+        f"Last run on {machine}, Python {platform.python_version()}:",
         "",
-        "| target | result | minutes | last line |",
-        "|---|---|---|---|",
+        "| target | result | minutes | date | commit | last line |",
+        "|---|---|---|---|---|---|",
+        *rows,
     ]
-    for outcome in outcomes:
-        last_line = outcome.last_line[:_LAST_LINE_WIDTH].replace("|", "\\|")
-        duration = f"{outcome.seconds / 60:.1f}"
-        lines.append(f"| `{outcome.target}` | {outcome.result} | {duration} | {last_line} |")
     return "\n".join(lines)
 
 
 def page(outcomes: Sequence[Outcome], folder: Path) -> str:
     """Return the page: the results, then the end of the output of each failed target."""
-    parts = ["# Long tests", table(outcomes, folder)]
+    commit = commit_of(folder)
+    parts = ["# Long tests", table(row(outcome, commit) for outcome in outcomes)]
     for outcome in outcomes:
         if outcome.is_passed:
             continue
@@ -146,6 +164,18 @@ def run_targets(
     return outcomes
 
 
+def report(outcomes: Sequence[Outcome], folder: Path) -> None:
+    """Replace the rows of these targets in the documentation; rows of other targets stay."""
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.setting import write_parts
+
+    rows = rows_by_target(REPORT.read_text("utf-8"))
+    commit = commit_of(folder)
+    for outcome in outcomes:
+        rows[outcome.target] = row(outcome, commit)
+    write_parts(REPORT, {"targets": table(rows.values())})
+
+
 def _say(text: str) -> None:
     sys.stdout.write(f"nightly: {text}\n")
     sys.stdout.flush()
@@ -169,10 +199,7 @@ def main() -> int:
     )
 
     if options.report:
-        sys.path.insert(0, str(ROOT))
-        from benchmarks.setting import write_parts
-
-        write_parts(REPORT, {"targets": table(outcomes, options.folder)})
+        report(outcomes, options.folder)
     failed = [outcome.target for outcome in outcomes if not outcome.is_passed]
     _say(f"failed: {' '.join(failed) or 'none'}; see out/nightly/page.md")
     return 1 if failed else 0

@@ -19,7 +19,7 @@ from controller.sources.touch import open_source
 from drivers.errors import CommandError
 from drivers.wires.wire import address_of
 from era_haptics.command import run_era
-from era_haptics.lab.design.problem import area_of
+from era_haptics.lab.design.era_area import area_of
 from kit.outside_files import READERS, RIG
 from model.commands.options import parse_frequencies
 from model.config.document import read_document

@@ -12,8 +12,11 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from era_haptics.lab.design.contact_rule import anywhere
+from era_haptics.lab.design.era_area import area_of
+from era_haptics.lab.design.given_layouts import layouts_of
 from era_haptics.lab.design.layout_search import LayoutSearch
-from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
+from era_haptics.lab.design.problem import DesignProblem
 from kit.plates import make_paper_rig, small_problem
 from model.answer.answer_report import Timing
 from model.answer.answer_report import measures as measures_of

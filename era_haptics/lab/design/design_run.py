@@ -13,17 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from era_haptics.lab.design.contact_rule import contact_rule
+from era_haptics.lab.design.era_area import EDGE, area_of
+from era_haptics.lab.design.given_layouts import NamedLayouts, supported_layouts
 from era_haptics.lab.design.layout_search import LayoutSearch, ScoredLayout
-from era_haptics.lab.design.problem import (
-    DEFAULT_ERA_GAP,
-    DEFAULT_LOWEST,
-    EDGE,
-    DesignProblem,
-    NamedLayouts,
-    area_of,
-    contact_rule,
-    supported_layouts,
-)
+from era_haptics.lab.design.problem import DEFAULT_ERA_GAP, DEFAULT_LOWEST, DesignProblem
 from era_haptics.lab.design.results import Assessment, Design, RankedLayout
 from era_haptics.lab.design.runner import LayoutListener, Machines, Runner, ignore_layout
 from model.answer.plan import answer

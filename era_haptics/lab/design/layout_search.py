@@ -10,13 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from era_haptics.lab.design.problem import (
-    ANYWHERE,
-    MIN_SUPPORTING,
-    SEARCH_FINGERS,
-    DesignProblem,
-    area_of,
-)
+from era_haptics.lab.design.era_area import ANYWHERE, area_of
+from era_haptics.lab.design.problem import MIN_SUPPORTING, SEARCH_FINGERS, DesignProblem
 from era_haptics.lab.design.score import PlaceReceptances, Scorer
 from model.arrays import FloatArray, best_by
 from model.errors import InputError
@@ -160,9 +155,9 @@ class LayoutSearch:
         """Return the score [dB] of positions among `places`, far below 0 if the plate is not
         supported."""
         if len(positions) + self.problem.supports >= MIN_SUPPORTING:
-            shortfall = self.problem.shortfall(positions)
-            if shortfall > 0:
-                return _UNSUPPORTED * (1 + shortfall)
+            deficit = self.problem.support_deficit(positions)
+            if deficit > 0:
+                return _UNSUPPORTED * (1 + deficit)
         numbers = (places.at == positions[:, None]).all(axis=-1).argmax(axis=1)
         return self._scorer.mean(places, numbers)
 

@@ -21,7 +21,7 @@ from controller.sources.touch import Touch, TouchFrame
 from era_haptics.command import run_era
 from era_haptics.lab.checks import layout_check
 from era_haptics.lab.checks.layout_check import check_layout
-from era_haptics.lab.design.problem import area_of
+from era_haptics.lab.design.era_area import area_of
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus, check_on_plate
 from model.arrays import FloatArray

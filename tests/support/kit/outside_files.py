@@ -20,13 +20,10 @@ from controller.effects.strengths import read_strengths
 from controller.gateway.gateway_settings import read_token
 from controller.sources.tuio_capture import read_capture
 from era_haptics.command import run_era
-from era_haptics.lab.design.problem import (
-    DesignProblem,
-    anywhere,
-    area_of,
-    contact_rule,
-    layouts_of,
-)
+from era_haptics.lab.design.contact_rule import anywhere, contact_rule
+from era_haptics.lab.design.era_area import area_of
+from era_haptics.lab.design.given_layouts import layouts_of
+from era_haptics.lab.design.problem import DesignProblem
 from era_haptics.lab.measuring.sensor_file import read_sensors
 from kit.plates import small_table
 from model.config.document import parse_document

@@ -12,19 +12,12 @@ import pytest
 
 from era_haptics.command import run_era
 from era_haptics.lab.design import problem as problem_module
+from era_haptics.lab.design.contact_rule import ContactRule, anywhere, contact_rule
 from era_haptics.lab.design.design_run import assess, rank_layouts
+from era_haptics.lab.design.era_area import Area, area_of, candidates_of, everywhere
 from era_haptics.lab.design.layout_keys import layout_keys
 from era_haptics.lab.design.layout_search import LayoutSearch
-from era_haptics.lab.design.problem import (
-    Area,
-    ContactRule,
-    DesignProblem,
-    anywhere,
-    area_of,
-    candidates_of,
-    contact_rule,
-    everywhere,
-)
+from era_haptics.lab.design.problem import DesignProblem
 from era_haptics.lab.design.runner import Runner
 from kit.plates import exciter_rig_text, make_paper_rig
 from model.arrays import ComplexArray, FloatArray
@@ -238,14 +231,14 @@ def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The best of some starts is the best of all triples of ERAs by a dense solve."""
-    monkeypatch.setitem(problem_module.CANDIDATES, True, 7)
+    monkeypatch.setattr(problem_module, "EDGE_CANDIDATES", 7)
     search = LayoutSearch(problem(rig=LOUD, count=3, contacts=OF_PAIRS))
     candidates = search.problem.candidates
     frequencies = search.problem.searched_frequencies
     dense_scores = {}
     for triple in combinations(range(len(candidates)), 3):
         places = candidates[list(triple)]
-        if search.problem.shortfall(places) == 0:
+        if search.problem.support_deficit(places) == 0:
             dense_scores[triple] = DenseScore(LOUD, places).mean(PAIRS, frequencies)
             (scored,) = search.scored([places])
             assert scored.score_db == pytest.approx(dense_scores[triple], abs=0.05), triple

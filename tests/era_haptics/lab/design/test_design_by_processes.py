@@ -6,8 +6,11 @@ from functools import partial
 import numpy as np
 import pytest
 
+from era_haptics.lab.design.contact_rule import anywhere
 from era_haptics.lab.design.design_run import rank_layouts
-from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
+from era_haptics.lab.design.era_area import area_of
+from era_haptics.lab.design.given_layouts import layouts_of
+from era_haptics.lab.design.problem import DesignProblem
 from era_haptics.lab.design.results import Design
 from era_haptics.lab.design.runner import Runner
 from kit.plates import make_paper_rig

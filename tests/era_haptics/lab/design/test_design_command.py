@@ -27,7 +27,7 @@ RIG = load_rig(RIG_PATH)
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A design of few candidates, frequencies and contact sets."""
-    monkeypatch.setitem(problem.CANDIDATES, True, 12)
+    monkeypatch.setattr(problem, "EDGE_CANDIDATES", 12)
     monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
     monkeypatch.setattr(problem, "SEARCH_FREQUENCIES", 3)
     monkeypatch.setattr(layout_search, "FINEST_STEP", 0.02)

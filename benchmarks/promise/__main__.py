@@ -1,18 +1,18 @@
 """Promised and felt contrast on plates within the tolerances: docs/measured/promise.md.
 
     python -m benchmarks.promise [--cases 1,2] [--plates 60] [--first 0] [--workers 2]
-    python -m benchmarks.promise contents|clicks|everyday|weather|air|levels [--sets N] [--plates N]
+    python -m benchmarks.promise PART [--sets N] [--plates N]
 
-Without a subcommand, it runs sessions through the complete signal chain, by case number. Each
+Without a part, it runs sessions through the complete signal chain, by case number. Each
 session has its own plate, ERAs, drives and fingertips, drawn within the uncertainty of the rig.
 --first is the seed of the first plate. Cases with events, which take ten times as long, use a
 quarter of the plates. Control loop, serial lines and amplifiers run in virtual time, and the plate
 is simulated in time under the fingers. Exits with status 1 unless 80 to 98 % of the promises are
 kept, both of default and of identified rigs.
 
-contents: by number of ERAs. clicks: without the wire. everyday: hands, force, objects and people;
---only WORD ... selects rows. weather: after a change of weather. air: with air around the plate.
-levels: with gains that depend on the level.
+Parts: contents: by number of ERAs. clicks: without the wire. everyday: hands, force, objects and
+people; --only WORD ... selects rows. weather: after a change of weather. air: with air around the
+plate. levels: with gains that depend on the level. modes: both drive modes, and a finger alone.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
-from benchmarks.promise import air, clicks, contents, everyday, levels, weather
+from benchmarks.promise import air, clicks, contents, everyday, levels, modes, weather
 from benchmarks.promise.cases import CASES
 from benchmarks.promise.report import as_markdown, kept
 from benchmarks.promise.session import Outcome, outcome
@@ -36,7 +36,7 @@ def main() -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parts = ("sessions", "contents", "clicks", "everyday", "weather", "air", "levels")
+    parts = ("sessions", "contents", "clicks", "everyday", "weather", "air", "levels", "modes")
     parser.add_argument("part", nargs="?", choices=parts, default="sessions")
     parser.add_argument("--cases", help="numbers of sessions from 0; default: all")
     parser.add_argument("--first", type=int, default=0, help="seed of the first plate")
@@ -57,6 +57,8 @@ def main() -> None:
         air.run(options.sets or 24, options.plates or 40)
     elif options.part == "levels":
         levels.run(options.sets or 24, options.plates or 40)
+    elif options.part == "modes":
+        modes.run(options.sets or 30)
     else:
         numbers = list(range(len(CASES)))
         if options.cases:

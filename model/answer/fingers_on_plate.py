@@ -205,6 +205,10 @@ class FingerForms:
         mean = (target_weights[:, None] @ contacts.fields[:, targets])[:, :, 0]
         # The field's variation over a target does not make its level uncertain.
         target_power = contacts.uncertain[:, targets] + outer(mean)
+        # Harmonics are felt, but do not make a target's level uncertain.
+        harmonic_power = (table.search_error_power - table.error_power)[self.rows, None]
+        eras = np.arange(len(table.eras))
+        target_power[..., eras, eras] -= harmonic_power
         forms = Forms(
             targets=mean.swapaxes(0, 1),
             target_power=target_power.swapaxes(0, 1),
@@ -215,7 +219,6 @@ class FingerForms:
         gain_variance = table.uncertainty.gain_variance(len(table.eras))
         if background is not None:
             rest_of_plate = background.copy()
-            eras = np.arange(rest_of_plate.shape[1])
             rest_of_plate[:, eras, eras] *= 1 + np.float32(gain_variance)
             return replace(forms, quiet=rest_of_plate[:, None])
         has_deep_nulls = gain_variance < MAX_VARIANCE_FINE

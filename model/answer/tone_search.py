@@ -13,6 +13,7 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
+from model.answer.answer import OWN_CONTRAST_DB, SAME_LEVEL
 from model.answer.fingers_on_plate import (
     CENTER_AND_FOUR,
     MAX_FINGERS_BY_POINT,
@@ -34,6 +35,7 @@ from model.arrays import (
 )
 from model.compiled.kernels import kernels
 from model.drive_forms import Forms, WeightedTones
+from model.drive_modes import UNRESTRICTED
 from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger import decibels
 from model.phased_weights import (
@@ -43,7 +45,7 @@ from model.phased_weights import (
     search_all,
     search_to_level,
 )
-from model.switched_patterns import find_switched, max_sensation_switched
+from model.switched_patterns import ALTERNATIVES, find_switched, max_sensation_switched
 from model.table.record import SAME_FREQUENCY
 from model.table.table import LocalizationTable
 
@@ -53,17 +55,34 @@ MAX_BY_POINT = 8
 IN_TIME = 3
 """Number of pulse candidates solved in time, the best by energy."""
 
+FEW_ROWS = 8
+"""Largest number of frequencies at which a phased answer is compared with switched patterns.
+
+With more, no pattern promised more in 960 questions; comparing takes as long as answering.
+"""
+
 _TINY = 1e-20  # power
 _TOO_LOUD = 1e12  # power of rejected candidates
 _BATCH = 64  # candidates evaluated together
 
 
 def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
-    """Choose tones for each content and compute their promises."""
+    """Choose tones for each content and compute their promises.
+
+    A promise of the drive mode `phased` is at least that of `switched` patterns at one frequency.
+    """
     library = kernels()
+    has_kernel = library is not None
     if library is not None and is_for_kernel(contents):
-        return ask_kernel(library, table, contents)
-    return choose_by_numpy(table, contents, by_kernel=library is not None)
+        tones = ask_kernel(library, table, contents)
+    else:
+        tones = choose_by_numpy(table, contents, by_kernel=has_kernel)
+    if not _could_be_switched(contents, tones):
+        return tones
+    switched = _choose_switched(table, contents, by_kernel=has_kernel)
+    if switched is None or not _is_better(switched, tones, contents.streams[0]):
+        return tones
+    return switched
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +148,17 @@ def choose_by_numpy(
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     ringing = RingingUnderFingers.of_streams(table, contents)
     candidates = _SEARCHES[contents.drive_mode](fingers, contents, ringing)
+    return _best_tones(fingers, contents, candidates, ringing)
+
+
+def _best_tones(
+    fingers: FingersOnPlate,
+    contents: Contents,
+    candidates: _Candidates,
+    ringing: Sequence[RingingUnderFingers | None],
+) -> Tones:
+    """Choose among candidates on drawn plates, and compute the promises."""
+    table = fingers.table
     judgment = _judged(fingers, contents, candidates, ringing)
     best = np.zeros(1, dtype=int)
     is_apart = True
@@ -138,6 +168,40 @@ def choose_by_numpy(
         best[0] = best_tone(contents, candidates.scores, judgment)
     tones = DriveTones.of([candidates.drives[number] for number in best.tolist()])
     return promised(fingers, contents, tones, is_apart=is_apart, ringing=ringing)
+
+
+def _could_be_switched(contents: Contents, tones: Tones) -> bool:
+    """Return whether a switched pattern could promise more than phased tones."""
+    is_single = len(contents.streams) == 1 and bool(contents.quiet)
+    is_phased = contents.drive_mode == UNRESTRICTED
+    is_weak = tones.worst_db < OWN_CONTRAST_DB
+    return is_single and is_phased and is_weak and len(contents.rows) <= FEW_ROWS
+
+
+def _choose_switched(
+    table: LocalizationTable, contents: Contents, *, by_kernel: bool
+) -> Tones | None:
+    """Choose the best switched pattern at one frequency, and promise it; None if there is none."""
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
+    ringing = RingingUnderFingers.of_streams(table, contents)
+    rows, forms = _switched_forms(fingers, contents, ringing)
+    candidates = list[_Candidate]()
+    for place in range(len(rows)):
+        at_row = forms.at(np.array([place]))
+        candidates += _pattern_candidates(at_row, rows[[place]], _groups(table))
+    if not candidates:
+        return None
+    candidates.sort(key=attrgetter("score"), reverse=True)
+    best_candidates = _Candidates.of(candidates[:ALTERNATIVES])
+    return _best_tones(fingers, contents, best_candidates, ringing)
+
+
+def _is_better(tones: Tones, other: Tones, stream: Stream) -> bool:
+    """Return whether tones promise a content more contrast than others, and no lower level."""
+    levels = [tones.level_db_sl[finger][1] for finger in stream.targets]
+    other_levels = [other.level_db_sl[finger][1] for finger in stream.targets]
+    is_as_loud = min(levels) >= min(other_levels) - SAME_LEVEL
+    return is_as_loud and tones.worst_db > other.worst_db
 
 
 def _coherent_candidates(
@@ -327,20 +391,41 @@ def _switched_candidates(
     Uses the ERAs of a single group at a time; near the highest level if no group reaches the
     requested level.
     """
+    rows, forms = _switched_forms(fingers, contents, ringing)
+    candidates = _pattern_candidates(forms, rows, _groups(fingers.table))
+    candidates.sort(key=attrgetter("score"), reverse=True)
+    return _Candidates.of(candidates)
+
+
+def _switched_forms(
+    fingers: FingersOnPlate,
+    contents: Contents,
+    ringing: Sequence[RingingUnderFingers | None],
+) -> tuple[IntArray, Forms]:
+    """Return the rows of the table that a single content can use, and the forms there."""
     (stream,) = contents.streams
     (stream_ringing,) = ringing
     quiet = contents.quiet
+    if not quiet:
+        stream_ringing = None
     rows = contents.rows
-    if stream_ringing is not None and quiet:
+    solved_rows = rows
+    if stream_ringing is not None:
         rows = stream_ringing.lasting_long_enough(rows)
+        solved_rows = np.arange(len(fingers.table.frequencies))
     is_by_point = stream_ringing is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
-    all_rows = np.arange(len(fingers.table.frequencies))
-    finger_forms = fingers.forms(all_rows, with_fine=is_by_point)
-    steady = finger_forms.of(stream.targets, quiet, stream.level_db_sl, contents.background)
+    finger_forms = fingers.forms(solved_rows, with_fine=is_by_point)
+    background = None if contents.background is None else contents.background[solved_rows]
+    steady = finger_forms.of(stream.targets, quiet, stream.level_db_sl, background)
     if is_by_point:
         steady = finger_forms.by_point(steady, quiet, CENTER_AND_FOUR)
-    forms = _forms_at(rows, steady, stream_ringing if quiet else None)
-    groups = _groups(fingers.table)
+    return rows, steady if stream_ringing is None else stream_ringing.forms(steady, rows)
+
+
+def _pattern_candidates(
+    forms: Forms, rows: IntArray, groups: Sequence[NDArray[np.bool_]]
+) -> list[_Candidate]:
+    """Find the best switched patterns of each group of ERAs, for forms at rows."""
     candidates = list[_Candidate]()
     patterns_by_group = _switched_patterns([forms.among(group) for group in groups])
     for group, patterns in zip(groups, patterns_by_group, strict=True):
@@ -349,8 +434,7 @@ def _switched_candidates(
             if is_within_group:
                 drive = [(int(rows[place]), weights) for place, weights in pattern]
                 candidates.append(_Candidate(0, 0, score, drive))
-    candidates.sort(key=attrgetter("score"), reverse=True)
-    return _Candidates.of(candidates)
+    return candidates
 
 
 _SEARCHES = {"switched": _switched_candidates, "phased": _coherent_candidates}

@@ -113,6 +113,10 @@ SHARED searched forms_of(const formed *found, const plates *on, const rules *by,
     value *target = values(memory, count * n), *expected_power = values(memory, count * n * n);
     char *is_other = take(memory, k);
     const size_t others = find_others(is_other, of, content, k);
+    lanes *error = take(memory, n * sizeof(lanes)), *harmonic = take(memory, n * sizeof(lanes));
+    load_real(error, by->error, n, rows);
+    load_real(harmonic, by->search_error, n, rows);
+    for (size_t e = 0; e < n; e++) harmonic[e] -= error[e]; /* is felt, but does not make a target's level uncertain */
     memset(target, 0, count * n * sizeof(value));
     for (size_t t = 0; t < count; t++) {
         const size_t finger = of->targets[first + t];
@@ -128,6 +132,7 @@ SHARED searched forms_of(const formed *found, const plates *on, const rules *by,
             for (size_t v = u; v < n; v++)
                 expected_power[(t * n + u) * n + v] =
                     add_conjugate_product(found->uncertain[(finger * n + u) * n + v], mean[u], mean[v]);
+        for (size_t e = 0; e < n; e++) expected_power[(t * n + e) * n + e].re -= harmonic[e];
     }
     const value **forms = take(memory, (others + 1) * sizeof(value *));
     const int is_deep = !by_point && by->is_deep && others && (int)others <= by->max_by_point;

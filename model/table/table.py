@@ -179,8 +179,7 @@ class LocalizationTable(TableRecord):
     def compared_harmonic_thresholds(self) -> Float32Array:
         """Thresholds at twice all frequencies for comparing candidates, (f,).
 
-        The lowest of all sets, relative to the set's threshold at the tone; the search for weights
-        uses the rig's own.
+        The lowest of all sets, relative to the set's threshold at the tone.
         """
         return np.asarray(self.harmonic_thresholds / self._harmonic_excess.max(axis=0))
 
@@ -318,10 +317,14 @@ class LocalizationTable(TableRecord):
 
     @cached_property
     def search_error_power(self) -> Float32Array:
-        """`error_power` with second harmonics counted at the drive frequency, for searches."""
+        """`error_power` with second harmonics counted at the drive frequency, for searches.
+
+        By the lowest threshold of all sets, like the promise.
+        """
         if not self.uncertainty.harmonic:
             return self.error_power
-        share = self.uncertainty.harmonic * (self.thresholds / self.harmonic_thresholds)[:, None]
+        excess = self.thresholds / self.compared_harmonic_thresholds
+        share = self.uncertainty.harmonic * excess[:, None]
         power = share**2 * mean_square_over_plate(self, self.at_harmonics.fields)
         return np.asarray(self.error_power + power, dtype=np.float32)
 

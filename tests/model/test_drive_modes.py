@@ -7,12 +7,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from kit.plates import by_hand, contact_sets, forms_of, smooth_table
+from kit.plates import by_hand, contact_sets, forms_of, make_paper_rig, smooth_table
 from model import phased_weights, switched_patterns
+from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import Complex64Array, Point
 from model.drive_forms import Forms, WeightedTones
 from model.drive_modes import playable_drive_modes
+from model.table.table_file import build_table
 
 FREQUENCY_COUNT, ERA_COUNT, POINT_COUNT = 5, 3, 3
 SIGMA = 0.1
@@ -150,6 +152,27 @@ def test_highest_switched_level_includes_two_tones() -> None:
     forms = Forms(unit[None], power, quiet, thresholds, 1.0, level_margin=0.0)
 
     assert HIGHEST_LEVELS["switched"](forms) == pytest.approx(np.sqrt(2), rel=1e-4)
+
+
+@pytest.mark.parametrize("band_hz", [(40.0, 40.0), (170.0, 170.0), (40.0, 60.0)])
+def test_phased_promises_at_least_as_much_as_switched(band_hz: tuple[float, float]) -> None:
+    """Weights of 0 and 1 are phased ones, so freer drives cannot promise less.
+
+    At 40 Hz, second harmonics dominate at quiet fingers.
+    """
+    table = build_table(make_paper_rig(12, 9), frequencies=np.arange(40.0, 201.0, 10.0))
+    gains = []
+    for places in [*contact_sets(6, fingers=3, seed=5), *contact_sets(6, fingers=4, seed=5)]:
+        placed = Placement((places[0],), tuple(places[1:]))
+        worst = {}
+        for mode in MODES:
+            answer = query(table, placed, 14.0, drive_mode=mode, band_hz=band_hz)
+            assert answer.is_reached
+            worst[mode] = answer.promised_worst_db
+        gains.append(worst["phased"] - worst["switched"])
+
+    assert min(gains) >= -0.01
+    assert np.mean(gains) > 1.0
 
 
 @pytest.mark.parametrize(

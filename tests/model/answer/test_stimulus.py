@@ -128,7 +128,7 @@ def test_kernel_agrees_with_numpy(name: str, seed: int) -> None:
     assert tones.rows == expected.rows
     assert tones.is_apart == expected.is_apart
     np.testing.assert_allclose(np.abs(tones.weights), np.abs(expected.weights), atol=0.02)
-    np.testing.assert_allclose(tones.gains, expected.gains, rtol=2e-3)
+    np.testing.assert_allclose(tones.gains, expected.gains, rtol=3e-3)
     np.testing.assert_allclose(tones.stroke_factor, expected.stroke_factor, rtol=2e-3)
     for key in ("contrast_db", "level_db_sl", "foreign_db_sl", "worst_db"):
         values = getattr(tones, key)

@@ -179,11 +179,6 @@ TOUCH_SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
 )
 
 
-def source_schemes() -> tuple[str, ...]:
-    """URL schemes of touch sources, plug-ins last."""
-    return TOUCH_SOURCES.names()
-
-
 def open_source(url: str) -> TouchSource:
     """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evdev:/dev/input/event5`.
 

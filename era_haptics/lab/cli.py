@@ -1,7 +1,4 @@
-"""`era report` (files for a bug report), and the other commands of the lab."""
-
-from pathlib import Path
-from typing import Annotated
+"""Commands of the lab."""
 
 import typer
 
@@ -13,42 +10,6 @@ from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.measuring.measure_cli import measure, outputs
 from era_haptics.lab.measuring.rig_cli import rig_app
 from era_haptics.lab.rig_page.page_cli import page
-from model.errors import InputError
-
-
-def report(
-    configs: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
-    ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to create.")] = Path(
-        "era-report"
-    ),
-    socket: Annotated[
-        Path | None,
-        typer.Option("--socket", help="Socket of the daemon. Default: its default path."),
-    ] = None,
-) -> None:
-    """Collect files for a bug report in a folder.
-
-    The folder contains versions, configuration files, the daemon's state and the end of its log,
-    reduced to harmless values of known keys. Free text, names, hosts and everything unknown are
-    hidden.
-    """
-    from era_haptics.lab.report import collect, write_report
-
-    for path in configs or ():
-        if not path.exists():
-            raise InputError(f"{path}: no such file; check its name and folder")
-    collected = collect(configs or [], socket=socket)
-    write_report(output, collected)
-    for name, file in collected.files.items():
-        source = "" if file.source is None else f" of {file.source}"
-        print(f"  {name}: {len(file.text)} characters{source}")
-    for what in collected.missing:
-        print(f"  skipped: {what}")
-    print(f"wrote {output}\nNext: read the files, then send the folder")
-
 
 amp = typer.Typer()
 amp.command()(conformance)
@@ -63,5 +24,5 @@ app.add_typer(layout_app, name="layout")
 app.add_typer(plate, name="plate")
 app.add_typer(rig_app, name="rig")
 app.add_typer(design_app)
-for _command in (play, report, measure, outputs):
+for _command in (play, measure, outputs):
     app.command()(_command)

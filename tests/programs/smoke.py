@@ -150,7 +150,6 @@ def try_files(era: InstalledEra) -> None:
     )
     era("plate", "map", "rig.yaml", "--drive", "SW=110", "--points", "12x9", "-o", "map.png")
     expect((era.folder / "map.png").stat().st_size > 1000, "no picture")
-    era("report", "daemon.yaml", "-o", "report.zip")
 
 
 def try_wire(era: InstalledEra) -> None:

@@ -17,10 +17,10 @@ class Judge(ExpectedAmplifier):
     Raises ContractViolation and TooLate.
     """
 
-    def __init__(self, can: Values, rest: Values, when: Interval) -> None:
+    def __init__(self, capabilities: Values, rest: Values, when: Interval) -> None:
         unclear = partial(require_in_time, False)
-        super().__init__(self._violated, self._violated, unclear=unclear, may_fail=False)
-        self.identified(can)
+        super().__init__(self._violated, unclear=unclear, may_fail=False)
+        self.identified(capabilities)
         self.check(rest, when)
 
     def _violated(
@@ -35,9 +35,9 @@ class Judge(ExpectedAmplifier):
         """
         driven = tuple(tone for tone in layer_set.commands if tone.is_driven)
         layer_set = replace(layer_set, commands=driven)
-        problem = achieved_problem(layer_set, reply, self.can, is_exact=False)
+        problem = achieved_problem(layer_set, reply, self.capabilities, is_exact=False)
         if problem:
             rule, quantity, expected, actual = problem
             quantity = f"{quantity} in layer {layer_set.layer}"
             self.report(rule, 0.0, quantity, expected=expected, actual=actual)
-        return achieved_layer(layer_set, reply, self.can)
+        return achieved_layer(layer_set, reply, self.capabilities)

@@ -166,7 +166,7 @@ class Subject(JudgedExchange):
         """Feed the watchdog if due, so that it was fed a while ago and is not due soon."""
         if self.feeding.used > _MAX_UNFED:
             await self.ping()
-        await asyncio.sleep(max(self.judge.fed.latest + _UNFED - threads.now(), 0.0))
+        await asyncio.sleep(max(self.judge.watchdog.fed.latest + _UNFED - threads.now(), 0.0))
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched, and judge all replies from now on."""

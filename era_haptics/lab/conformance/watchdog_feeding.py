@@ -31,7 +31,11 @@ class WatchdogFeeding:
     def used(self) -> float:
         """Share of the watchdog time that has passed; 0 if it need not be fed."""
         judge = self._judge_to_feed
-        return 0.0 if judge is None else (threads.now() - judge.fed.earliest) / judge.watchdog
+        return (
+            0.0
+            if judge is None
+            else (threads.now() - judge.watchdog.fed.earliest) / judge.watchdog.time
+        )
 
     @property
     def is_due(self) -> bool:
@@ -45,7 +49,7 @@ class WatchdogFeeding:
     def sleep_time(self, remaining: float) -> float:
         """Return how long [s] of a remaining time to sleep before the next look at the watchdog."""
         judge = self._judge_to_feed
-        return remaining if judge is None else min(remaining, _SLEEP * judge.watchdog)
+        return remaining if judge is None else min(remaining, _SLEEP * judge.watchdog.time)
 
     @property
     def _judge_to_feed(self) -> Judge | None:

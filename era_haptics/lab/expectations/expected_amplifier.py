@@ -8,7 +8,7 @@ status.
 import math
 from typing import NamedTuple
 
-from drivers.protocol.achieved import FLAGS, TONE, AchievedProblem, achieved_problem
+from drivers.protocol.achieved import TONE
 from drivers.protocol.definition import (
     ENABLED,
     FAULTS,
@@ -21,12 +21,14 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_newer_token, token_after
+from era_haptics.lab.expectations.expected_achieved import check_achieved
 from era_haptics.lab.expectations.expected_clock import ExpectedClock
 from era_haptics.lab.expectations.expected_faults import ExpectedFaults
 from era_haptics.lab.expectations.expected_outputs import ExpectedOutputs
 from era_haptics.lab.expectations.expected_set import ExpectedSet
+from era_haptics.lab.expectations.expected_watchdog import ExpectedWatchdog
 from era_haptics.lab.expectations.mismatches import ReportMismatch, ReportUnclear, alternatives
-from era_haptics.lab.expectations.tolerances import DRIFT, ROUNDED, UNKNOWN, Interval
+from era_haptics.lab.expectations.tolerances import ROUNDED, UNKNOWN, Interval
 
 OFF = STATES["SWITCH_ON_DISABLED"]
 STOPPED = STATES["QUICK_STOP_ACTIVE"]
@@ -39,7 +41,6 @@ FADE = 0.005
 FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
 """Requests that feed the watchdog unless they are rejected."""
 
-_TRIP = 0.005  # s; from the end of the watchdog time until the watchdog trips
 _SETTLING = 0.01  # s; until a state is reported
 _STATE_AFTER_FADE = {SWITCHED_ON: OFF, REACTING: FAULT}
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # above this temperature an amplifier can derate
@@ -74,59 +75,70 @@ def request_text(name: str, values: Values) -> str:
 class ExpectedAmplifier:
     """Expected state of an amplifier; times [s]. Unknown state, latch, token and session: None.
 
-    - report: receives violations; always: receives violations that nothing excuses; unclear:
-      receives the reason why the state is unknown.
+    - report: receives violations; unclear: receives the reason why the state is unknown.
     - may_fail: the amplifier can have faults of its own.
-    - slack: tolerance of times; left_slack: tolerance of the watchdog's remaining time.
-    - fed: last time the watchdog was fed; silent: when all fades have ended.
-    - is_shown: the amplifier has reported its state itself.
-    - last_status: start of the interval without observations.
-    - can: the amplifier's capabilities.
+    - slack: tolerance of times.
     """
 
     def __init__(
         self,
         report: ReportMismatch,
-        always: ReportMismatch,
         *,
         unclear: ReportUnclear | None = None,
         may_fail: bool = True,
         slack: float = 0.0,
-        left_slack: float = ROUNDED,
     ) -> None:
-        self.can: Values = {}
         self.report = report
         self.slack = slack
-        self._report_always = always
+        self.capabilities: Values = {}
+        """Reply to GetCaps, empty while unknown."""
+        self.last_status = -math.inf
+        """Start of the interval without observations."""
         self._report_unclear = unclear
         self._may_fail = may_fail
-        self._left_slack = left_slack
+        # `forget` sets all that follow.
+        self.state: int | None
+        self.session: int | None
+        self.token: int | None
+        """Token of the set committed last, 0 after an Arm."""
+        self.latch: int | None
+        self.fault: int
+        self.is_shown: bool
+        """Whether the amplifier has reported its state itself."""
+        self.silent: Interval
+        """When all fades have ended."""
+        self.sets: ExpectedSet
+        self.clock: ExpectedClock
+        self.watchdog: ExpectedWatchdog
+        self.outputs: ExpectedOutputs
+        self._faults: ExpectedFaults
+        self._waiting: _WaitingSet | None
+        self._started: float
+        """Latest start of a waiting set."""
         self.forget()
-        self.last_status = -math.inf
 
     def forget(self, cause: str = "missed messages") -> None:
         """Treat everything as unknown until the next status."""
-        self.token: int | None = None
-        self.session: int | None = None
-        self.state: int | None = None
+        self.state = None
+        self.session = None
+        self.token = None
+        self.latch = None
         self.fault = FAULTS["NONE"]
-        self.latch: int | None = None
+        self.is_shown = True
+        self.silent = UNKNOWN
         self.sets = ExpectedSet()
         self.clock = ExpectedClock(self.report, self.slack)
-        self.watchdog = math.inf
-        self.fed = UNKNOWN
-        self.silent = UNKNOWN
-        self.is_shown = True
-        self._waiting: _WaitingSet | None = None
-        self._started = -math.inf  # latest start of a waiting set
+        self.watchdog = ExpectedWatchdog(self.report, self.slack)
         self._faults = ExpectedFaults(self.report, self.slack)
+        self._waiting = None
+        self._started = -math.inf
         self._settle(cause)
         self.outputs.forget()
 
     def _settle(self, cause: str, when: Interval = UNKNOWN) -> None:
         """Treat all channels as silent from some time in an interval."""
         self.outputs = ExpectedOutputs(
-            self.can,
+            self.capabilities,
             report=self.report,
             unclear=self._report_unclear,
             slack=self.slack,
@@ -135,9 +147,9 @@ class ExpectedAmplifier:
         )
 
     def identified(self, capabilities: Values) -> None:
-        """Note its capabilities."""
-        if capabilities != self.can:
-            self.can = capabilities
+        """Record the capabilities of the amplifier."""
+        if capabilities != self.capabilities:
+            self.capabilities = capabilities
             self._settle("missed messages")
             self.outputs.forget()
 
@@ -161,15 +173,6 @@ class ExpectedAmplifier:
         """Return whether it is in a fault or reacting to one."""
         return self.state in (REACTING, FAULT)
 
-    @property
-    def expiry(self) -> Interval:
-        """Return the earliest and latest time at which the watchdog trips if it is not fed."""
-        if self.watchdog == math.inf:  # not known
-            return UNKNOWN
-        min_time = self.watchdog * (1 - DRIFT)
-        max_time = (self.watchdog + _TRIP) * (1 + DRIFT)
-        return Interval(self.fed.earliest + min_time - ROUNDED, self.fed.latest + max_time)
-
     # Requests
 
     def granted(self, name: str, values: Values, reply: Values, when: Interval) -> None:
@@ -178,12 +181,13 @@ class ExpectedAmplifier:
         self._check_allowed(name, values, when.latest)
         may_have_expired = reply.get("state") in (REACTING, FAULT)
         if name in FEEDING and self.state in (None, ENABLED) and not may_have_expired:
-            self.fed = when
+            self.watchdog.fed = when
         match name:
             case "Set":
                 self._take(values, reply, when)
             case "GetAchieved":
-                self._check_achieved(values["layer"], reply, when)
+                if not self.may_start(when):
+                    self._check_achieved(values["layer"], reply, when)
             case "GetFaults":
                 self._faults.check(reply["faults"], when)
             case _:
@@ -200,7 +204,7 @@ class ExpectedAmplifier:
             self.report("session", time, quantity, expected=self.session, actual=session)
         if self.token and token not in (0, self.token) and not is_newer_token(token, self.token):
             expected = f"newer than {self.token}"
-            self._report_always("token", time, f"token of {name}", expected=expected, actual=token)
+            self.report("token", time, f"token of {name}", expected=expected, actual=token)
         if self.state not in (None, *_ONLY_IN.get(name, (self.state,))):
             rule = _RULE_OF_STATE.get(name, "enabled") if self.is_shown else "watchdog"
             quantity = f"reply to {name} in {self._name_of(self.state)}"
@@ -208,7 +212,8 @@ class ExpectedAmplifier:
 
     def carry_out(self, name: str, values: Values, status: Values, when: Interval) -> None:
         """Apply a request carried out in an interval; status: its reply, or a later status."""
-        ramp = min(values.get("ramp", 0), self.can.get("ramp_max", math.inf)) / 1000
+        ramp_max = self.capabilities.get("ramp_max", math.inf)
+        ramp = min(values.get("ramp", 0), ramp_max) / 1000
         cause = request_text(name, values)
         if name in ("Stop", "Disarm"):
             self._trip_if_expired(status, when)
@@ -236,8 +241,9 @@ class ExpectedAmplifier:
     def _trip_if_expired(self, status: Values, when: Interval) -> None:
         """Trip the watchdog before a request if the status shows that it had expired."""
         has_expired = self.is_enabled and status.get("fault") == FAULTS["WATCHDOG"]
-        if has_expired and when.latest >= self.expiry.earliest:
-            self._trip(FAULTS["WATCHDOG"], self._expired_by(when.latest), "the watchdog")
+        if has_expired and when.latest >= self.watchdog.expiry.earliest:
+            tripped = self.watchdog.trip_interval(when.latest, self.last_status)
+            self._trip(FAULTS["WATCHDOG"], tripped, "the watchdog")
 
     def _arm(self, values: Values, when: Interval, cause: str) -> None:
         """Hold a session; a new one begins silent."""
@@ -249,8 +255,8 @@ class ExpectedAmplifier:
         self.fault = FAULTS["NONE"]
         self.session = session
         self.is_shown = True
-        self.watchdog = values["watchdog"] / 1000
-        self.fed = when
+        self.watchdog.time = values["watchdog"] / 1000
+        self.watchdog.fed = when
 
     def _clear(self, latch: int, state: int, when: Interval) -> None:
         """Leave a stop or a fault once everything is silent, if its cause has gone."""
@@ -265,8 +271,8 @@ class ExpectedAmplifier:
 
     def advance(self, time: float) -> None:
         """Apply everything that must have happened without a request until now."""
-        if self.is_enabled and time > self.expiry.latest + ROUNDED + self.slack:
-            self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
+        if self.is_enabled and self.watchdog.must_have_tripped(time):
+            self._trip(FAULTS["WATCHDOG"], self.watchdog.expiry, "the watchdog")
             self.is_shown = False
         if self._waiting is not None and time > self._waiting.start.latest + self.slack:
             self._start_waiting()
@@ -316,7 +322,8 @@ class ExpectedAmplifier:
 
     def _check_exact(self, token: int, reply: Values, when: Interval) -> None:
         """Compare `exact`: set for a whole set that an amplifier without steps plays."""
-        has_fine_steps = all(self.can.get(f"{quantity}_step", 1) <= 1 for quantity in TONE)
+        steps = [self.capabilities.get(f"{quantity}_step", 1) for quantity in TONE]
+        has_fine_steps = max(steps) <= 1
         if not (reply["staged"] or reply["played"]):
             self._expect("plays", when, f"exact of set {token}, not whole", 0, reply["exact"])
         elif has_fine_steps and not self.outputs.may_derate:
@@ -328,7 +335,7 @@ class ExpectedAmplifier:
         is_held = self.state in (None, ENABLED) and self.session in (None, part["session"])
         is_newer = is_newer_token(part["token"], self.token or 0)
         if is_held and is_newer and self.sets.keep(part, when):
-            self.fed = when
+            self.watchdog.fed = when
 
     def part_refused(self, part: Values, code: str) -> None:
         """Apply the rejection of a set's last part, according to the code."""
@@ -396,26 +403,14 @@ class ExpectedAmplifier:
             quantity = f"token after {self.outputs.cause}"
             self._expect("token", when, quantity, self.token, status["token"])
         self.token = status["token"]
-        self._check_watchdog_left(status["watchdog_left"] / 1000, when)
+        remaining = status["watchdog_left"] / 1000
+        cause = self.outputs.cause
+        self.watchdog.check_remaining(remaining, when, is_enabled=self.is_enabled, cause=cause)
         self.clock.check(status["clock"], when)
         if not self.may_start(when):
             self.outputs.check(status, when)
         self._check_voltage(status, when)
         self.last_status = when.earliest
-
-    def _check_watchdog_left(self, remaining: float, when: Interval) -> None:
-        """Compare the watchdog's remaining time [s]."""
-        low = high = 0.0
-        if self.is_enabled:
-            if self.watchdog == math.inf:
-                return
-            slack = self._left_slack + self.slack
-            low = self.watchdog - (when.latest - self.fed.earliest) - slack
-            high = self.watchdog - (when.earliest - self.fed.latest) + slack
-        if not low <= remaining <= max(high, 0.0):
-            quantity = f"watchdog_left after {self.outputs.cause}"
-            expected = f"{low:.6g} to {high:.6g}"
-            self.report("watchdog", when.latest, quantity, expected=expected, actual=remaining)
 
     def note_state(self, status: Values, when: Interval) -> bool:
         """Compare state, fault and latch, and adopt them; returns whether the state is possible."""
@@ -458,7 +453,7 @@ class ExpectedAmplifier:
                 self._settle(self._name_of(state), when)
                 self.silent = past
             elif state == ENABLED:
-                self.fed = past
+                self.watchdog.fed = past
                 self.outputs.forget()
             if self.is_in_fault:
                 self._faults.add(status["fault"], past)
@@ -497,29 +492,14 @@ class ExpectedAmplifier:
         fault_time = Interval(min(self.last_status, when.latest), when.latest)
         name = name_of(FAULTS, fault)
         if fault == FAULTS["WATCHDOG"]:
-            self._check_trip_time(when)
-            fault_time = self._expired_by(when.latest)
+            enabled_until = when.latest if self.is_enabled else self.outputs.began.latest
+            self.watchdog.check_trip(enabled_until, when, cause=self.outputs.cause)
+            fault_time = self.watchdog.trip_interval(when.latest, self.last_status)
         elif fault == FAULTS["NONE"] or not self._may_fail:
             expected = "WATCHDOG" if fault else "one"
             quantity = "fault of a fault reaction"
             self.report("state", when.latest, quantity, expected=expected, actual=name)
         self._trip(fault, fault_time, f"fault {name}")
-
-    def _check_trip_time(self, when: Interval) -> None:
-        """Check that the watchdog did not trip early."""
-        early, late = self.expiry
-        enabled_until = when.latest if self.is_enabled else self.outputs.began.latest
-        if enabled_until < early - self.slack:
-            quantity = f"time of the watchdog ({self.outputs.cause})"
-            expected = f"from {early:.4f} to {late:.4f} s"
-            actual = f"{when.latest:.4f} s"
-            self.report("watchdog", when.latest, quantity, expected=expected, actual=actual)
-
-    def _expired_by(self, time: float) -> Interval:
-        """Return the interval in which the watchdog tripped, if it had tripped by `time`."""
-        early, late = self.expiry
-        earliest = min(max(early, self.last_status), time)
-        return Interval(earliest, max(min(late, time), earliest))
 
     def _check_voltage(self, status: Values, when: Interval) -> None:
         """Check high voltage, and the interlock if the amplifier has one."""
@@ -534,60 +514,13 @@ class ExpectedAmplifier:
             is_on = has_flag(status, "high_voltage")
             self._expect("high_voltage", when, f"high_voltage {condition}", must_be_on, is_on)
 
-    # Achieved values
-
     def _check_achieved(self, layer: int, reply: Values, when: Interval) -> None:
         """Compare the achieved values of a layer with its commands."""
-        if self.may_start(when):
-            return
-        sure_layers = self.outputs.sure(when)
-        if not sure_layers:
-            return
-        problem = self._achieved_problem(layer, reply, sure_layers)
-        if problem is not None:
-            report = self.report if reply["commands"] else self.report_silence
-            quantity = f"{problem.quantity} of achieved layer {layer}"
-            report(
-                problem.rule,
-                when.latest,
-                quantity,
-                expected=problem.required,
-                actual=problem.received,
-            )
-
-    def _achieved_problem(
-        self, layer: int, reply: Values, sure_layers: set[int]
-    ) -> AchievedProblem | None:
-        """Return the first difference between a reply to GetAchieved and the commands of a
-        layer."""
-        outputs = self.outputs
-        possible_tokens = outputs.tokens_of(layer, sure_layers)
-        if reply["token"] not in possible_tokens:
-            return AchievedProblem("token", "token", alternatives(possible_tokens), reply["token"])
-        if layer not in sure_layers:
-            return None
-        problem = achieved_problem(
-            outputs.playback.playing(layer),
+        check_achieved(
+            layer,
             reply,
-            self.can,
-            is_exact=outputs.is_exact,
-            can_scale=outputs.may_derate or not outputs.is_exact,
+            when,
+            outputs=self.outputs,
+            capabilities=self.capabilities,
+            report=self.report,
         )
-        if problem is not None:
-            return problem
-        rows = (reply, *reply["commands"])
-        flags = [name for row in rows for name in FLAGS if row.get(name)]
-        if flags:
-            return AchievedProblem("plays", "flags", [], flags)
-        lasting = outputs.lasting.get(layer, {0}) if reply["commands"] else {0}
-        if reply["valid_for"] not in lasting:
-            return AchievedProblem("plays", "valid_for", sorted(lasting), reply["valid_for"])
-        if reply["ramp"] and not reply["commands"]:
-            return AchievedProblem("plays", "ramp of a silent layer", 0, reply["ramp"])
-        return None
-
-    def report_silence(
-        self, rule: str, time: float, quantity: str, *, expected: object, actual: object
-    ) -> None:
-        """Report unexpected silence as a violation that a hidden fault could explain."""
-        self.report(rule, time, quantity, expected=expected, actual=actual)

@@ -36,7 +36,7 @@ class ExpectedOutputs:
     """Expected channels and layers of an amplifier, initially silent; times and intervals in
     seconds.
 
-    - can: capabilities, empty while unknown.
+    - capabilities: reply to GetCaps, empty while unknown.
     - slack [s]: tolerance of times.
     - began, cause: interval and cause of the last change.
     - is_exact: levels equal the commands within one step; may_derate: levels can be lower because
@@ -47,7 +47,7 @@ class ExpectedOutputs:
 
     def __init__(
         self,
-        can: Values,
+        capabilities: Values,
         *,
         report: ReportMismatch,
         unclear: ReportUnclear | None,
@@ -61,13 +61,13 @@ class ExpectedOutputs:
         self.may_derate = False
         self.interferes = False
         self.lasting: dict[int, set[int]] = {}
-        self.playback = playback_of(can) if can else silent()
+        self.playback = playback_of(capabilities) if capabilities else silent()
         """Playback with each commit in the middle of its interval."""
         self.uncertain_playback = UncertainPlayback(self.playback)
         self._report = report
         self._report_unclear = unclear
         self._slack = slack
-        self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
+        self._half_step = capabilities.get("level_step", 1) / 2 / _LEVEL.per_unit
         self._has_floor = True  # False after a fault, which can cut a fade short
         self._unknown_until = [-math.inf] * _LAYERS  # s; of the output of each layer
         self._former_levels: Sequence[float] = ()  # of the channels, before the last set

@@ -33,7 +33,7 @@ class AmplifierRules(ExpectedAmplifier):
     """Judges the replies and Events of one simulated amplifier, at its end of the wire."""
 
     def __init__(self, device: AmplifierDevice, violations: list[RuleViolation]) -> None:
-        super().__init__(self._note, self._note, slack=_SLACK)
+        super().__init__(self._note, slack=_SLACK)
         self._name = device.name
         self._violations = violations
         self._obey = device.handle

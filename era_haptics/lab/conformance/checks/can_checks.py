@@ -436,7 +436,7 @@ async def _expect_emergencies(subject: Subject) -> None:
     client = cast(CanClient, subject.client)
     await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.feeding.starve])
     client.frames.clear()
-    due = threads.now() + subject.judge.watchdog + _SETTLING
+    due = threads.now() + subject.judge.watchdog.time + _SETTLING
     while threads.now() < due:
         await asyncio.sleep(_POLL)
         if client.data_of("emergency"):

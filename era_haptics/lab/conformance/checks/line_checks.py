@@ -83,7 +83,7 @@ async def _expect_unrequested_event(subject: Subject, *, has_events: bool) -> No
     """Let the watchdog expire without a request, and require an Event."""
     client = subject.client
     count = len(client.history)
-    await asyncio.sleep(subject.judge.watchdog + _TRIPPED)
+    await asyncio.sleep(subject.judge.watchdog.time + _TRIPPED)
     if not has_events:
         return
     if len(client.history) == count:

@@ -104,7 +104,7 @@ async def watchdog_unread(subject: Subject) -> None:
     Run the count from a timer or with the samples, not in the handler of requests.
     """
     await subject.run([partial(subject.arm, 0.0), subject.layer_0(), subject.feeding.starve])
-    await asyncio.sleep(subject.judge.watchdog + 0.03)
+    await asyncio.sleep(subject.judge.watchdog.time + 0.03)
     await subject.run([send("GetFaults")])
 
 
@@ -216,7 +216,7 @@ async def trips_amid_other_requests(subject: Subject) -> None:
         partial(subject.client.exchange, 63, ()),
     )
     judge = subject.judge
-    end = judge.fed.earliest + 0.7 * judge.watchdog - subject.timing.exchange_time
+    end = judge.watchdog.fed.earliest + 0.7 * judge.watchdog.time - subject.timing.exchange_time
     for row in cycle(rows):
         if threads.now() > end:
             break

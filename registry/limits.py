@@ -18,8 +18,8 @@ MAX_FINGER_LOAD = 10.0
 HAND_LOAD = 12.0
 """Load of a resting hand of unknown size, in fingertips.
 
-It lies between two estimates for the heel of a hand: 7 from its force (10 N, to the power of two
-thirds) and 30 from its area (20 cm²). Sources and uncertainty: docs/concepts/people.md.
+The value is between two estimates for the heel of a hand: 7 from its force (10 N, to the power of
+two thirds) and 30 from its area (20 cm²). Sources and uncertainty: docs/concepts/people.md.
 """
 
 MAX_HAND_LOAD = 40.0

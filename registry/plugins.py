@@ -49,7 +49,7 @@ _REMEDY = "repair or remove that package"
 
 @dataclass(frozen=True)
 class PluginRegistry(Generic[_T]):
-    """Objects of one kind by name; names can be URL schemes."""
+    """Objects of a kind by name; names can be URL schemes."""
 
     what: str
     """The kind of object, for error messages."""
@@ -251,7 +251,7 @@ def _entry_points(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoi
 
 @cache
 def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """Return one plug-in of each other package, by its top-level module."""
+    """Return one plug-in of each other package, by top-level module."""
     by_module: dict[str, EntryPoint] = {}
     for group in entry_points().groups:
         if not group.startswith(_GROUP_PREFIX):

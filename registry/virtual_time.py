@@ -101,9 +101,9 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 class VirtualLoopRunner:
-    """Virtual-time loop in a thread of its own, in which time passes only while it runs work.
+    """Virtual-time loop in a separate thread; time passes only while the loop runs work.
 
-    Between two calls all its tasks stand still, for as long as the caller takes.
+    Its tasks pause between two calls, however long the caller takes.
     """
 
     def __init__(self) -> None:

@@ -151,14 +151,6 @@ def outputs(
             metavar="DEVICE", help='Sound card: PortAudio number, "NAME" or "NAME, HOST API".'
         ),
     ],
-    beside: Annotated[
-        int | None,
-        typer.Option(
-            metavar="INPUT",
-            help="Input of an accelerometer that you place next to each actuator in turn.",
-            min=1,
-        ),
-    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -191,17 +183,15 @@ def outputs(
 ) -> None:
     """Find which output drives which actuator.
 
-    Plays a soft tone on each output in turn and prompts for the actuator that moved. With --beside,
-    an accelerometer (of any sensitivity) detects the actuator instead, and also detects dead, loose
-    or reversed actuators. Exits with status 1 if there are any, or if channels differ from the
-    rig's and --output is missing.
+    Plays a soft tone on each output in turn and prompts for the actuator that moved. Exits with
+    status 1 if an actuator is missing, or if channels differ from the rig's and --output is
+    missing.
     """
     from era_haptics.lab.measuring.outputs import find_outputs
 
     rows, answer, is_right = find_outputs(
-        rig_file, device, beside=beside, output=output, count=count, level=level,
-        frequency=frequency,
-    )  # fmt: skip
+        rig_file, device, output=output, count=count, level=level, frequency=frequency
+    )
     print_report(rows, answer, as_json=as_json)
     if not is_right:
         raise typer.Exit(_WRONG)

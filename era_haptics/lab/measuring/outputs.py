@@ -1,13 +1,11 @@
 """Find which sound-card output drives which actuator by playing on one output after the other.
 
-Either a person feels or sees a soft tone, or an accelerometer is placed next to each actuator in
-turn (`era_haptics.lab.measuring.output_matching`).
+A person feels or sees a soft tone.
 """
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,7 @@ import numpy as np
 import typer
 
 from era_haptics.lab.measuring.desk import Desk
-from era_haptics.lab.measuring.multisine import Multisine, ResponseEstimate, estimate, ramped
-from era_haptics.lab.measuring.output_matching import OutputFinding, findings_of
-from era_haptics.lab.measuring.recording_checks import check_levels
-from era_haptics.lab.measuring.runs import play_on_one, run_time
+from era_haptics.lab.measuring.multisine import ramped
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from model.arrays import FloatArray
 from model.commands.calibrate_cli import check_rig_output
@@ -37,10 +32,16 @@ PAUSE = 0.2
 """Pause after a burst [s]."""
 
 _BURSTS = 3
-_OCTAVES = 4.0  # highest over lowest line
-_STEP = 20  # Hz; lines are one above its multiples, so that sums of two fall between lines
-_PERIODS = 2
 _NONE, _AGAIN = "-", "r"  # replies on the terminal
+
+
+@dataclass(frozen=True)
+class OutputFinding:
+    """ERA that an output drives, None for none; the output is counted from 1."""
+
+    output: int
+    era: str | None
+    verdict: str
 
 
 def tone(
@@ -64,42 +65,10 @@ def tone(
     return np.asarray(np.tile(burst, (_BURSTS, 1)) * np.eye(outputs)[output - 1])
 
 
-def listen_to_outputs(
-    desk: Desk,
-    card: SoundCard,
-    beside: int,
-    *,
-    outputs: int,
-    level: float,
-    move: Callable[[str], None],
-) -> list[OutputFinding]:
-    """Play on each output for a few seconds at each position, and assign it to an actuator.
-
-    beside: input, counted from 1, of the accelerometer that is placed next to each actuator; move:
-    called with the name of the next actuator. Raises InputError or LinkError for a clipped or
-    silent input, InputError if outputs cannot be distinguished.
-    """
-    limits = desk.rig.limits
-    high = min(limits.frequency_max, _OCTAVES * limits.frequency_min)
-    lines = np.arange(1.0, high + 1e-6, _STEP)
-    sines = Multisine(lines[lines >= limits.frequency_min], 1, card.rate, level)
-    desk.check_times(seconds=run_time(_PERIODS), slew=sines.slew)
-    estimates: list[list[ResponseEstimate]] = []
-    for era in desk.rig.eras:
-        move(era.name)
-        runs = []
-        for output in range(1, outputs + 1):
-            runs.append(play_on_one(card, sines, output, outputs=outputs, periods=_PERIODS))
-        check_levels(np.concatenate(runs), {beside: f"sensor next to {era.name}"})
-        estimates.append([estimate(sines, [run[:, [beside - 1]]]) for run in runs])
-    return findings_of(desk.rig, sines.frequencies, estimates)
-
-
 def find_outputs(
     rig_file: Path,
     device: str,
     *,
-    beside: int | None,
     output: Path | None,
     count: int | None,
     level: float,
@@ -107,8 +76,7 @@ def find_outputs(
 ) -> tuple[list[str], dict[str, Any], bool]:
     """Find which output drives which actuator; return the report, and whether all are correct.
 
-    beside: input of an accelerometer, None to ask on the terminal; output: rig file to write;
-    frequency [Hz]: of the audible tone. Raises InputError, LinkError.
+    output: rig file to write; frequency [Hz]: of the audible tone. Raises InputError, LinkError.
     """
     rig = load_rig(rig_file)
     if output is not None:
@@ -116,13 +84,8 @@ def find_outputs(
     desk = Desk(rig, ())
     desk.check_level(level)
     count = count or max(desk.wiring.era_outputs.values())
-    with closing(open_card(device, outputs=count, inputs=beside or 0, limit=level)) as card:
-        if beside is None:
-            findings = _requested(desk, card, count, level=level, frequency=frequency)
-        else:
-            findings = listen_to_outputs(
-                desk, card, beside, outputs=count, level=level, move=_prompt_to_move
-            )
+    with closing(open_card(device, outputs=count, inputs=0, limit=level)) as card:
+        findings = _requested(desk, card, count, level=level, frequency=frequency)
     rig_channels = {name: number - 1 for name, number in desk.wiring.era_outputs.items()}
     channels = {finding.era: finding.output - 1 for finding in findings if finding.era}
     missing = [name for name in rig_channels if name not in channels]
@@ -137,9 +100,8 @@ def find_outputs(
         files = [str(output)]
         rows.append(f"wrote {output}")
     elif not (missing or is_as_in_rig):
-        option = ["--beside", str(beside)] if beside is not None else []
         wired = rig_file.with_stem("wired")
-        rows.append(next_line("era", "outputs", rig_file, "--device", device, "-o", wired, *option))
+        rows.append(next_line("era", "outputs", rig_file, "--device", device, "-o", wired))
     answer = {
         "outputs": [asdict(finding) for finding in findings],
         "channels": channels,
@@ -147,15 +109,8 @@ def find_outputs(
         "is_as_in_rig": is_as_in_rig,
         "files": files,
     }
-    are_well = all(finding.verdict == "ok" for finding in findings if finding.era)
-    return rows, answer, are_well and not missing and (is_as_in_rig or bool(files))
-
-
-def _prompt_to_move(name: str) -> None:
-    """Wait until the accelerometer is next to an actuator."""
-    typer.prompt(
-        f"Put the accelerometer next to {name}, and press Enter", "", show_default=False, err=True
-    )
+    is_right = not missing and (is_as_in_rig or bool(files))
+    return rows, answer, is_right
 
 
 def _requested(
@@ -196,8 +151,7 @@ def _rows(
     missing: Sequence[str],
 ) -> Iterator[str]:
     """Yield a table of the outputs, then the channels if they differ from the rig."""
-    has_levels = any(finding.relative_level is not None for finding in findings)
-    yield "output  drives      channel" + ("  polarity    level" if has_levels else "")
+    yield "output  drives      channel"
     for finding in findings:
         yield _row(finding, rig_channels).rstrip()
     if missing:
@@ -211,14 +165,9 @@ def _rows(
 
 def _row(finding: OutputFinding, rig_channels: Mapping[str, int]) -> str:
     """Format the finding for one output."""
-    era = finding.era or "-"
-    channel = str(finding.output - 1) if finding.era else "-"
-    measured = ""
-    if finding.polarity and finding.relative_level:
-        sign = "+" if finding.polarity > 0 else "-"
-        measured = f"  {sign:>8s}  {20 * math.log10(finding.relative_level):+5.1f} dB"
-    verdict = finding.verdict
-    if finding.era and finding.output - 1 != rig_channels[finding.era]:
-        verdict = f"the rig has channel {rig_channels[finding.era]}; {verdict}"
-    verdict = verdict.removesuffix("ok").removesuffix("; ")
-    return f"{finding.output:6d}  {era:10s} {channel:>8}{measured}  {verdict}"
+    if finding.era is None:
+        return f"{finding.output:6d}  {'-':10s} {'-':>8}  {finding.verdict}"
+    channel = finding.output - 1
+    rig_channel = rig_channels[finding.era]
+    verdict = "" if channel == rig_channel else f"the rig has channel {rig_channel}"
+    return f"{finding.output:6d}  {finding.era:10s} {channel:>8}  {verdict}"

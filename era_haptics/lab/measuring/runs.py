@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.multisine import PERIOD, Multisine
+from era_haptics.lab.measuring.multisine import PERIOD
 from era_haptics.lab.measuring.settling import MIN_SETTLING
 from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import FloatArray
@@ -71,21 +69,3 @@ def play_and_record(
         if is_whole(kept):
             return Run(kept, True, repeated)
     return Run(kept, False, tries - 1)
-
-
-def play_on_one(
-    card: SoundCard, sines: Multisine, output: int, *, outputs: int, periods: int
-) -> FloatArray:
-    """Play a multisine on one output, counted from 1, without a loop-back.
-
-    Return whole periods of the recording (n, inputs); repeats if the device reports gaps. Raises
-    LinkError after three attempts.
-    """
-    signal = sines.signal(0, periods=run_time(periods) / PERIOD)
-    return play_and_record(
-        card,
-        signal * np.eye(outputs)[output - 1],
-        settling=MIN_SETTLING,
-        seconds=PERIOD * periods,
-        is_whole=lambda _kept: not card.gaps,
-    ).whole

@@ -13,6 +13,7 @@ from era_haptics.lab.measuring.desk import Desk
 from era_haptics.lab.measuring.outputs import tone
 from era_haptics.lab.measuring.sensor_file import WiredSensor
 from kit.desk_plate import Converters, DeskPlate, Truth
+from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -21,6 +22,15 @@ from tests.era_haptics.lab.measuring.card_in_memory import DeskCard
 RATE = 8_000.0
 EXAMPLE = Path(__file__).parents[4] / "examples" / "desk" / "rig.yaml"
 SENSITIVITY = 0.01  # not known to the command
+
+
+class CardWithoutLoopBack(DeskCard):
+    """A card that plays on the ERAs alone."""
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """Advance the plate; the output of the loop-back is silent."""
+        silence = np.zeros((len(played), 1))
+        return super().run(np.hstack([played, silence]))
 
 
 def test_tone_is_soft_on_one_output_within_the_limits(rig: Rig) -> None:
@@ -58,7 +68,7 @@ def test_typed_channels_are_written(
     """If all ERAs have an output; `r` repeats a tone."""
     sensors = [WiredSensor("A1", 0.1, 0.1, 1, SENSITIVITY)]
     plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
-    card = DeskCard(plate, rate=RATE)
+    card = CardWithoutLoopBack(plate, rate=RATE)
     monkeypatch.setattr("era_haptics.lab.measuring.outputs.open_card", lambda *_, **__: card)
     rig_file, output = tmp_path / "rig.yaml", tmp_path / "wired.yaml"
     shutil.copy(EXAMPLE, rig_file)

@@ -15,8 +15,9 @@ from matplotlib import style
 
 from era_haptics.drive import as_points
 from era_haptics.lab.rig_page import page_pictures, page_sections
-from era_haptics.lab.rig_page.page_pictures import svg_of
 from era_haptics.lab.rig_page.page_sections import html_of, table_rows
+from era_haptics.lab.rig_page.page_style import STYLE, svg_of
+from era_haptics.lab.rig_page.plate_drawing import drawing_picture
 from era_haptics.lab.rig_page.rig_report import RigReport, report_of
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.stimulus import check_on_plate
@@ -103,8 +104,8 @@ def page_text(report: RigReport) -> str:
 
 def _figures(report: RigReport, levels: FloatArray) -> dict[str, str]:
     """Draw the figures of a page, by name."""
-    with style.context(["default", page_pictures.STYLE]):
-        drawing = page_pictures.drawing_picture(report)
+    with style.context(["default", STYLE]):
+        drawing = drawing_picture(report)
         curves = page_pictures.levels_picture(report, levels)
         shapes = page_pictures.modes_picture(report)
         figures = {

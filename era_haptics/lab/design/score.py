@@ -15,7 +15,7 @@ where dh comes from the plates thicker and thinner by one standard deviation, ea
 with half weight, dc from the ERAs' damping, and s_j from each ERA's stiffness and the finger's
 load. The last term is over the plate without fingers, like `LocalizationTable.error_power`. The
 score of a set is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, minus a
-tenth of the shortfall from the wanted level, since an answer that has to reach the level loses
+tenth of the missing level, since an answer that has to reach the level loses
 little contrast. With several contents it is the score of the worst one, with all other fingers
 quiet, because their crosstalk sums to little more than the highest. Each content is then searched
 at a multiple of the level, since they share the stroke.
@@ -28,26 +28,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_rows
+from era_haptics.lab.design.set_scores import SetScores
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.ensemble.attached_plate import Mounts, mounts_of
 from model.ensemble.expected_power import expected_power, power_of
-from model.finger import FIVE_POINTS, STRONG_DB_SL, Grid, detection_threshold, fingertips_on
+from model.finger import FIVE_POINTS, Grid, fingertips_on
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import coupled_forces
 from model.structure.exciter import Actuator
 
-BEST_FREQUENCIES = 3
-"""Frequencies of each set at which the maximum over the quiet fingers is minimized."""
-
-LEVEL_PENALTY = 0.1
-"""Score penalty per dB of missing level; with 1 instead of 0 to 0.15, scores predict answers
-worse."""
-
-_LEVEL_RESERVE = 1.2
-"""Factor on the wanted level, as 90 % of plates need more than the nominal plate."""
-
-_LAWSON_STEPS = 2
 _SMALLEST = np.float32(1e-30)
 
 
@@ -105,7 +95,7 @@ class Scorer:
         self._mounts = mounts_of(eras, (), omega, rig.uncertainty)
         self._minus_omega2 = self._mounts.minus_omega2[:, None, None]
         self._finger_stiffness = _finger_stiffness(rig, omega)
-        self._required = _required_levels(rig, frequencies, contents)
+        self._set_scores = SetScores(rig, frequencies, contents)
         self._free = solve_free_plate(plate, rig.mesh, frequency_max=float(frequencies.max()))
         centers, numbers = np.unique(np.vstack(sets), axis=0, return_inverse=True)
         points, weights = fingertips_on(
@@ -168,7 +158,7 @@ class Scorer:
         scores = []
         for content in range(self._contents):
             content_first = np.roll(fingers, -content, axis=1)
-            scores.append(self._score(target, power, content_first))
+            scores.append(self._set_scores.of_sets(target, power, content_first))
         return np.asarray(np.min(scores, axis=0))
 
     # Fields
@@ -287,64 +277,6 @@ class Scorer:
         force = self._minus_omega2 * eras.by_damping[:, :, None] * motion
         return np.asarray((flat_transfer @ force).reshape(transfer.shape))
 
-    # Scores of fields
-
-    def _score(
-        self, target: Complex64Array, power: Complex64Array, fingers: IntArray
-    ) -> FloatArray:
-        """Return the score [dB] for sets (s, k) of fingers, (s,); only the first finger has the
-        content."""
-        frequencies = np.arange(len(target))
-        quiet = fingers[:, 1:]
-        quiet_count = quiet.shape[1]
-        c = target[:, fingers[:, 0]].conj()  # (f, s, n)
-        if quiet_count == 1:
-            mean_power = power[:, quiet[:, 0]]
-        else:
-            mean_power = power[:, quiet].sum(axis=2) / np.float32(quiet_count)
-        w = np.linalg.solve(mean_power, c[..., None])[..., 0]
-        # The mean over the quiet fingers bounds the maximum.
-        bound = self._decibels(np.vecdot(c, w).real, c, w, frequencies[:, None])
-        if quiet_count == 1:
-            return np.asarray(bound.max(axis=0), dtype=float)
-        rows = best_rows(bound, min(BEST_FREQUENCIES, len(target)))
-        kept = (rows, np.arange(len(fingers)))
-        return self._minimax_score(c[kept], w[kept], power[rows[..., None], quiet], rows)
-
-    def _minimax_score(
-        self, c: Complex64Array, w: Complex64Array, power: Complex64Array, rows: IntArray
-    ) -> FloatArray:
-        """Return the best score [dB] while Lawson's algorithm minimizes the loudest quiet finger.
-
-        c, w (r, s, n): of r frequencies; power (r, s, q, n, n); rows (r, s): frequency numbers.
-        """
-        best = np.full(w.shape[1], -np.inf)
-        shares = np.ones(power.shape[:3], dtype=np.float32)
-        for step in range(_LAWSON_STEPS + 1):
-            by_finger = w[:, :, None]
-            expected = np.vecdot(by_finger, np.matvec(power, by_finger)).real
-            loudest = np.maximum(expected.max(axis=2), _SMALLEST)
-            score = np.abs(np.vecdot(c, w)) ** 2 / loudest
-            decibels = self._decibels(score, c, w, rows)
-            best = np.maximum(best, decibels.max(axis=0))
-            if step < _LAWSON_STEPS:
-                shares = shares * np.sqrt(np.maximum(expected, _SMALLEST))
-                shares /= shares.sum(axis=2, keepdims=True)
-                flat_power = power.reshape(*power.shape[:3], -1)
-                weighted = (shares[:, :, None] @ flat_power).reshape(*w.shape, -1)
-                w = np.linalg.solve(weighted, c[..., None])[..., 0]
-        return np.asarray(best, dtype=float)
-
-    def _decibels(
-        self, score: Float32Array, c: Complex64Array, w: Complex64Array, rows: IntArray
-    ) -> Float32Array:
-        """Return scores (f, s) of weights (f, s, n), minus the penalty for missing level."""
-        stroke = np.maximum(np.abs(w).max(axis=-1), _SMALLEST)
-        level = np.abs(np.vecdot(c, w)) / stroke
-        surplus = 20 * np.log10(np.maximum(level, _SMALLEST) / self._required[rows])
-        decibels = 10 * np.log10(np.maximum(score, _SMALLEST))
-        return np.asarray(decibels + LEVEL_PENALTY * np.minimum(surplus, 0))
-
 
 def _thicknesses_of(uncertainty: Uncertainty) -> FloatArray:
     """Return relative thicknesses (v,): the nominal plate, then one standard deviation up and down.
@@ -360,12 +292,6 @@ def _finger_stiffness(rig: Rig, omega: FloatArray) -> Complex64Array:
     if rig.fingertip is None:
         return np.zeros((len(omega), 1), dtype=np.complex64)
     return rig.fingertip.dynamic_stiffness(omega).astype(np.complex64)[:, None]
-
-
-def _required_levels(rig: Rig, frequencies: FloatArray, contents: int) -> Float32Array:
-    """Return the acceleration (f,) [m/s²] that each content needs, including a reserve."""
-    factor = _LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
-    return (factor * detection_threshold(frequencies, rig.threshold)).astype(np.float32)
 
 
 def _grouped_by_size(numbers: IntArray, sizes: Sequence[int]) -> tuple[IntArray, ...]:

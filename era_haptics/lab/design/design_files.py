@@ -125,7 +125,6 @@ def _layout_row(layout: RankedLayout) -> dict[str, Any]:
         "stiffness_n_m": eras[-1].in_time.stiffness,
         "supported": layout.found.is_supported,
         "score": layout.score,
-        "expected_contrast_db": layout.score,  # its former name, for one release
         "contrast_db": layout.judged.summary if layout.judged else None,
     }
 

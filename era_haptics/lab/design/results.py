@@ -109,11 +109,6 @@ class RankedLayout:
         return self.found.score_db if self.found.is_supported else None
 
     @property
-    def expected_contrast(self) -> float | None:
-        """The score, under its former name."""
-        return self.score
-
-    @property
     def rig(self) -> Rig:
         """The rig with these ERAs on free channels, if necessary on a new, simulated amplifier."""
         rig_data = document_for(self.problem.rig).data

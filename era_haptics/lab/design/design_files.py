@@ -1,6 +1,6 @@
 """Files and JSON of a design: the rig with the best layout, a table of all layouts, a template."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,31 +41,31 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
 
 def _columns(design: Design) -> dict[str, Any]:
     """Return the columns of the table of all layouts."""
-    rows = [_layout_row(layout) for layout in design.layouts]
+    rows = [_csv_row(layout) for layout in design.layouts]
     columns: dict[str, Any] = {"rank": range(1, len(rows) + 1)}
-    for key in rows[0]:
-        columns[key] = ["" if row[key] is None else row[key] for row in rows]
-    columns["at_m"] = [_positions_text(row["at_m"]) for row in rows]
-    columns["contrast_db"] = [
-        f"{layout.mean_db:.6g}" if layout.judged else "" for layout in design.layouts
-    ]
+    for name in rows[0]:
+        columns[name] = [row[name] for row in rows]
     return columns
 
 
-def _positions_text(positions: Mapping[str, tuple[float, float]]) -> str:
-    return " ".join(f"({x:.6g};{y:.6g})" for x, y in positions.values())
+def _csv_row(layout: RankedLayout) -> dict[str, Any]:
+    """Return the cells of a layout by column, empty for unknown values."""
+    cells = _layout_row(layout)
+    positions = [f"({x:.6g};{y:.6g})" for x, y in cells["at_m"].values()]
+    cells["at_m"] = " ".join(positions)
+    cells["score"] = "" if layout.score is None else layout.score
+    cells["contrast_db"] = "" if layout.judged is None else f"{layout.mean_db:.6g}"
+    return cells
 
 
 def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     """Return the text of the rig file with the best layout's ERAs on free channels."""
     best = design.best
     keys = layout_keys(design.problem, best.found.positions, data)
-    amplifiers = design.problem.rig.amplifiers
-    added_names = [name for name in keys["amplifiers"] if name not in amplifiers]
-    comment = (
-        f"# Designed for contrast: {best.count} ERAs, {best.mean_db:.1f} dB over new contact "
-        "sets.\n"
-    )
+    contrast = f"{best.count} ERAs, {best.mean_db:.1f} dB over new contact sets"
+    comment = f"# Designed for contrast: {contrast}.\n"
+    own_names = design.problem.rig.amplifiers.keys()
+    added_names = [name for name in keys["amplifiers"] if name not in own_names]
     if added_names:
         names = ", ".join(added_names)
         comment += f"# Replace the URLs of amplifiers {names} by URLs of real amplifiers.\n"
@@ -74,28 +74,30 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
 
 def design_summary(design: Design) -> dict[str, Any]:
     """The design for JSON."""
-    problem, best = design.problem, design.best
+    problem = design.problem
+    best = design.best
     rig = problem.rig
     frequencies = rigid_body_frequencies(rig.plate, best.eras, loads=rig.masses)
-    by_count = {str(count): layout.mean_db for count, layout in design.by_count.items()}
-    by_stiffness = {
-        f"{stiffness:g}": layout.mean_db for stiffness, layout in design.by_stiffness.items()
-    }
+    by_count = {}
+    for count, layout in design.by_count.items():
+        by_count[str(count)] = layout.mean_db
+    by_stiffness = {}
+    for stiffness, layout in design.by_stiffness.items():
+        by_stiffness[f"{stiffness:g}"] = layout.mean_db
+    unsupported = [layout for layout in design.layouts if not layout.found.is_supported]
+    own_contrast = None if design.own is None else design.own.summary
     return {
         "eras": _era_rows(design),
         "contrast_db": best.answers.summary,
-        "own_contrast_db": None if design.own is None else design.own.summary,
+        "own_contrast_db": own_contrast,
         "reached_share": best.answers.reached_share,
         "starts_db": [layout.mean_db for layout in design.starts],
         "gap_db": design.gap_db,
         "by_count_db": by_count,
         "by_stiffness_db": by_stiffness,
         "layout_count": len(design.layouts),
-        "unsupported": sum(not layout.found.is_supported for layout in design.layouts),
-        "layouts": [
-            {"rank": rank, **_layout_row(layout)}
-            for rank, layout in enumerate(design.layouts[:MAX_SHOWN], start=1)
-        ],
+        "unsupported": len(unsupported),
+        "layouts": _ranked_rows(design.layouts),
         "lowest_rigid_body_hz": float(frequencies[0]),
         "contents": problem.contacts.contents,
         "sets": len(design.sets),
@@ -116,13 +118,22 @@ def _era_rows(design: Design) -> dict[str, dict[str, Any]]:
     return rows
 
 
+def _ranked_rows(layouts: Sequence[RankedLayout]) -> list[dict[str, Any]]:
+    """Return the best layouts with their ranks for JSON."""
+    rows = []
+    for rank, layout in enumerate(layouts[:MAX_SHOWN], start=1):
+        rows.append({"rank": rank, **_layout_row(layout)})
+    return rows
+
+
 def _layout_row(layout: RankedLayout) -> dict[str, Any]:
-    """A layout for JSON."""
-    eras = layout.eras
+    """Return a layout for JSON."""
+    positions = {era.name: [era.x, era.y] for era in layout.eras}
+    new_era = layout.eras[-1]
     return {
         "layout": layout.name,
-        "at_m": {era.name: [era.x, era.y] for era in eras},
-        "stiffness_n_m": eras[-1].in_time.stiffness,
+        "at_m": positions,
+        "stiffness_n_m": new_era.in_time.stiffness,
         "supported": layout.found.is_supported,
         "score": layout.score,
         "contrast_db": layout.judged.summary if layout.judged else None,
@@ -150,14 +161,15 @@ class UnfinishedDesign:
     def summary(self) -> dict[str, Any]:
         """The layouts for JSON."""
         layouts = self.layouts
+        evaluated = [layout for layout in layouts if layout.judged is not None]
+        rows = _ranked_rows(layouts)
+        for row, layout in zip(rows, layouts, strict=False):
+            row["layout"] = _unique_name(layout)
         return {
             "incomplete": True,
             "layout_count": len(layouts),
-            "judged": sum(layout.judged is not None for layout in layouts),
-            "layouts": [
-                {"rank": rank, **_layout_row(layout), "layout": _unique_name(layout)}
-                for rank, layout in enumerate(layouts[:MAX_SHOWN], start=1)
-            ],
+            "judged": len(evaluated),
+            "layouts": rows,
         }
 
     def write(self, path: Path) -> None:

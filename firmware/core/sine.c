@@ -23,10 +23,10 @@ int32_t sine(uint32_t angle)
     return times(x, sum);
 }
 
-uint32_t square_root(uint64_t x)
+uint32_t square_root(uint32_t x)
 {
-    uint64_t root = 0;
-    for (uint64_t bit = UINT64_C(1) << 62; bit != 0; bit >>= 2) {
+    uint32_t root = 0;
+    for (uint32_t bit = UINT32_C(1) << 30; bit != 0; bit >>= 2) {
         if (x >= root + bit) {
             x -= root + bit;
             root = (root >> 1) + bit;
@@ -34,5 +34,5 @@ uint32_t square_root(uint64_t x)
             root >>= 1;
         }
     }
-    return (uint32_t)root;
+    return root;
 }

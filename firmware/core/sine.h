@@ -46,6 +46,6 @@ static inline int32_t raised_cosine(uint32_t along)
 }
 
 // Largest integer whose square is not above x.
-uint32_t square_root(uint64_t x);
+uint32_t square_root(uint32_t x);
 
 #endif

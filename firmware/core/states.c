@@ -217,7 +217,7 @@ void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
 // force, so that nothing beats and there is no harmonic, whatever the voices play together.
 static int16_t voltage_of(int32_t force)
 {
-    return (int16_t)square_root((uint64_t)(force + INT16_MAX) * INT16_MAX / 2);
+    return (int16_t)square_root((uint32_t)(force + INT16_MAX) * INT16_MAX / 2);
 }
 
 static int16_t sample_of(int32_t force)

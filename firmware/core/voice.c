@@ -159,7 +159,7 @@ int32_t voice_sample(struct voice *voice, uint32_t clock)
     return value;
 }
 
-static struct complex earlier(const struct voice *voice, uint32_t before)
+struct complex voice_amplitude(const struct voice *voice, uint32_t before)
 {
     uint64_t way = (uint64_t)voice->stride * before;
     if (voice->stride == 0)
@@ -169,7 +169,7 @@ static struct complex earlier(const struct voice *voice, uint32_t before)
 
 struct complex voice_pointer(const struct voice *voice, uint32_t clock, uint32_t before)
 {
-    struct complex amplitude = earlier(voice, before);
+    struct complex amplitude = voice_amplitude(voice, before);
     uint32_t angle = voice->frequency * clock;
     int32_t re = cosine(angle), im = sine(angle);
     struct complex turned = {.re = times(amplitude.re, re) - times(amplitude.im, im),

@@ -62,8 +62,10 @@ static inline bool voice_outlasts(const struct voice *voice, uint16_t millisecon
 // Value at this sample, at a time of the clock, in units of 2^-30 of full level; then move on by one.
 int32_t voice_sample(struct voice *voice, uint32_t clock);
 
-// Its amplitude some samples before, or at the beginning of its present line if that is later, turned
-// by the angle of its oscillator: those of one frequency add up.
+// Its amplitude some samples before, or at the beginning of its present line if that is later.
+struct complex voice_amplitude(const struct voice *voice, uint32_t before);
+
+// This amplitude, turned by the angle of its oscillator: those of one frequency add up.
 struct complex voice_pointer(const struct voice *voice, uint32_t clock, uint32_t before);
 
 #endif

@@ -14,10 +14,10 @@
 
 #include <string.h>
 
-// Samples are made ahead of the converter, to bridge a tick and the longest request. The levels in
-// Status are ahead of its clock by as much, so this must be at most 0.2 ms.
+// Samples are made ahead of the converter, to bridge a tick and the longest request: every set starts
+// later by as much.
 #ifndef SAMPLES_AHEAD
-#define SAMPLES_AHEAD (SAMPLES_PER_MS / 5)
+#define SAMPLES_AHEAD (SAMPLES_PER_MS / 2)
 #endif
 #define TICK 125 // us; longest sleep
 #ifndef STALL_MAX

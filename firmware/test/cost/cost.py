@@ -3,7 +3,7 @@
 Builds `cost.c` for each core and configuration, runs it in QEMU instruction by instruction, and
 adds up cycles from the tables of Arm's technical reference manuals. Flash has no wait states, and
 the stack excludes interrupts. Fails if a processor does not carry its configuration with all voices
-on their ramps, or starts a set later than 2 ms.
+on their ramps, starts a set later than 2 ms, or makes no sample for longer than its buffer lasts.
 """
 
 import re
@@ -229,10 +229,11 @@ HEAD = """\
 | kcycles of a Ping: silent, all voices | kcycles of a set | MHz |
 |---|---|---|---|---|---|---|
 """
-SAMPLES_AHEAD = 0.2e-3  # s
+SAMPLES_AHEAD = 0.5e-3  # s; in the converter's buffer
 MAX_SET_TIME = 2e-3  # s; from the last byte to the start
 MAX_LOAD = 0.9
 SETS = ("Set on full pools", "start of a set at a moment")
+REQUESTS = ("Ping with full pools", "Set on full pools", "Commit", "Silence")
 
 
 class Cost(NamedTuple):
@@ -247,6 +248,11 @@ class Cost(NamedTuple):
     def set_cycles(self) -> int:
         """Cycles of the longest start of a set."""
         return max(self.works[name].cycles for name in SETS)
+
+    @property
+    def request_cycles(self) -> int:
+        """Cycles of the longest request."""
+        return max(self.works[name].cycles for name in REQUESTS)
 
     @property
     def sample_cycles(self) -> int:
@@ -292,8 +298,12 @@ def fits(configuration: Configuration, cost: Cost, name: str) -> bool:
     rate = {**DEFAULTS, **configuration.options}["SAMPLE_RATE"]
     load = cost.sample_cycles * rate / processor.clock_rate
     set_time = SAMPLES_AHEAD + cost.set_cycles / processor.clock_rate
-    sys.stdout.write(f"{name}: load {load:.0%}, a set starts after {1e3 * set_time:.2f} ms\n")
-    return load < MAX_LOAD and set_time < MAX_SET_TIME
+    gap = (cost.request_cycles + cost.sample_cycles) / processor.clock_rate  # between two samples
+    sys.stdout.write(
+        f"{name}: load {load:.0%}, a set starts after {1e3 * set_time:.2f} ms, "
+        f"samples are at most {1e3 * gap:.2f} ms apart\n"
+    )
+    return load < MAX_LOAD and set_time < MAX_SET_TIME and gap < SAMPLES_AHEAD
 
 
 def main() -> None:

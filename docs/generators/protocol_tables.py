@@ -127,7 +127,8 @@ _STATUS_MEANINGS = {
     "clock": "see [the clock](#the-clock)",
     "token": "token of the last set committed since Arm; 0: none",
     "channels, layers": "see Capabilities",
-    "levels": "level of each channel (below) at `clock`, or up to 0.2 ms earlier",
+    "levels": "level of each channel (below) at `clock`, or up to 0.2 ms earlier, but not from "
+    "before the request or set that `state` and `tokens` show",
     "tokens": "token of the set that each layer plays; 0: the layer is over",
 }
 

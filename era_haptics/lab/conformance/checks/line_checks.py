@@ -14,9 +14,11 @@ from drivers.protocol.definition import (
     name_of,
 )
 from drivers.protocol.records import Values
+from drivers.wires.modbus_frames import BOX, HEAD, REPLY_OFFSET
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.checks.request_checks import UNKNOWN_NUMBERS, valid_words
 from era_haptics.lab.conformance.judge_client import HeardMessage, JudgeClient
+from era_haptics.lab.conformance.modbus_client import ModbusClient
 from era_haptics.lab.conformance.outcomes import (
     ContractViolation,
     TooLate,
@@ -223,7 +225,10 @@ async def addresses(subject: Subject) -> None:
     move: Values = {"address": client.free_address, "serial_number": serial_number}
     await _expect_not_moved(subject, move)
     try:
-        await subject.request("SetAddress", **move)
+        if isinstance(client, ModbusClient):
+            await _move_by_reading(subject, client, move)
+        else:
+            await subject.request("SetAddress", **move)
         await asyncio.sleep(_MOVED)
         await _expect_moved(client, own_address)
         if client.has_broadcasts and not client.neighbors:
@@ -235,8 +240,10 @@ async def addresses(subject: Subject) -> None:
 
 async def _expect_not_moved(subject: Subject, move: Values) -> None:
     """Require that a SetAddress with wrong values, or while armed, is rejected."""
-    serial_number = move["serial_number"]
-    for wrong_number in {serial_number + "x", serial_number[:-1], ""} - {serial_number}:
+    serial_number = str(move["serial_number"])
+    other_end = "y" if serial_number.endswith("x") else "x"
+    wrong_numbers = {serial_number + "x", serial_number[:-1], serial_number[:-1] + other_end, ""}
+    for wrong_number in wrong_numbers - {serial_number}:
         values = {**move, "serial_number": wrong_number}
         await subject.run([send("SetAddress", **values, code="BAD_VALUE")])
     _, *text = MESSAGES["SetAddress"].request.pack(move)
@@ -244,6 +251,15 @@ async def _expect_not_moved(subject: Subject, move: Values) -> None:
         await subject.run([send("SetAddress", raw=[address, *text], code="BAD_VALUE")])
     while_armed = send("SetAddress", **move, code="WRONG_STATE")
     await subject.run([subject.arm, while_armed, DISARM_NOW, subject.settle])
+
+
+async def _move_by_reading(subject: Subject, client: ModbusClient, move: Values) -> None:
+    """Write a SetAddress, use other areas at the old address, then read the reply."""
+    message = MESSAGES["SetAddress"]
+    await client.part(message.number, message.request.pack(move))
+    await subject.request("GetAchieved", layer=0)
+    await subject.request("GetStatus")
+    await client.read(BOX * message.number + REPLY_OFFSET, HEAD)
 
 
 async def _expect_moved(client: JudgeClient, old_address: int) -> None:

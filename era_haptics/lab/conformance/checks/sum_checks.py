@@ -4,7 +4,7 @@ import asyncio
 import math
 from functools import partial
 
-from drivers.protocol.definition import HIGH_TIME, HIGH_WORDS, has_flag
+from drivers.protocol.definition import HIGH_TIME, HIGH_WORDS, MESSAGES, has_flag
 from drivers.protocol.sets import Command, Envelope
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.outcomes import expect_equal, require
@@ -18,6 +18,7 @@ from era_haptics.lab.conformance.request_rows import (
     play_now,
 )
 from era_haptics.lab.conformance.subject import Subject
+from registry import threads
 
 _SLOW = 400  # steps of frequency: 20 Hz, whose period is long compared with an exchange
 _LONG = 1.0  # s; phase errors accumulate over this time
@@ -219,6 +220,8 @@ async def limited(subject: Subject) -> None:
     """
     is_loud = subject.level * 2 > 1.0
     require(is_loud, "tested only above half of full level; see --level")
+    if subject.client.has_broadcasts:
+        await subject.client.look_around()
     difference = abs(subject.second_frequency - subject.frequency)
     has_two_frequencies = difference >= subject.can["frequency_step"]
     require(has_two_frequencies, "all tones have the same frequency and interfere")
@@ -254,6 +257,19 @@ async def _expect_unseen_limit(subject: Subject, name: str, **values: int) -> No
     await subject.send_all([play_now(layer(0), above), fading])
     await asyncio.sleep(_PEAK_TIME)
     await subject.request("GetAchieved", layer=0)
+    client = subject.client
+    if client.has_broadcasts and not client.neighbors:
+        await _broadcast_commit(subject)
     reply = await subject.request(name, **values)
     is_limited = has_flag(reply.values, "limited")
     expect_equal(is_limited, True, "flag limited after a sum above full level")
+
+
+async def _broadcast_commit(subject: Subject) -> None:
+    """Broadcast the Commit of the last token again: without a Status, it must not clear a flag."""
+    sent_at = threads.now()
+    message = MESSAGES["Commit"]
+    values = subject.filled({"token": subject.sets.token, "at": 0})
+    data = subject.client.request(message.number, message.request.pack(values), to=0)
+    await subject.client.expect_silence(data, "a broadcast Commit")
+    subject.judge.granted("Commit", values, {}, subject.since(sent_at))

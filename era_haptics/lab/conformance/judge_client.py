@@ -16,7 +16,13 @@ from drivers.protocol.definition import NAK, NAK_RECORD, REACTION, REQUEST_NAMES
 from drivers.protocol.records import Values
 from drivers.wires.wire import read_nak
 from era_haptics.lab.conformance.lateness import ON_THE_WAY, Lateness
-from era_haptics.lab.conformance.outcomes import NoReply, expect_equal, read_as, verify
+from era_haptics.lab.conformance.outcomes import (
+    LateReply,
+    NoReply,
+    expect_equal,
+    read_as,
+    verify,
+)
 from era_haptics.lab.expectations.tolerances import Interval
 from registry import threads
 
@@ -262,15 +268,16 @@ class JudgeClient(ABC):
         message = await self.next_message(is_meant, self.timeout)
         if message is not None:
             return message
-        remark = ""
+        failure, remark = NoReply, ""
         if self.last_bytes:
             remark = f", but {len(self.last_bytes)} other bytes{self.remark()}"
         has_new_message = any(message.at > started_at for message in self.history[-1:])
         is_sound = not remark or has_new_message
         if is_sound and await self.next_message(is_meant, _DELIVERY_TIMEOUT):
             self.lateness.note_delay(self.timeout)
+            failure = LateReply
             remark = f", but later: a delay of {ON_THE_WAY}, or of the amplifier"
-        raise NoReply(request, f"no reply within {self.timeout:g} s{remark}")
+        raise failure(request, f"no reply within {self.timeout:g} s{remark}")
 
     def remark(self) -> str:
         """Describe the error in bytes received instead of a reply, if known."""

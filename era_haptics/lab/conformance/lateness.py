@@ -58,6 +58,11 @@ class Lateness:
         return max(self.lag, self.delay) > BUSY
 
     @property
+    def is_machine_late(self) -> bool:
+        """Return whether this machine was late in this attempt."""
+        return self.lag > BUSY
+
+    @property
     def cause(self) -> str:
         """Return what was late in this attempt, and by how much."""
         if self.slow_reply:

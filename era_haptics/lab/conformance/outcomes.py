@@ -44,6 +44,10 @@ class NoReply(ContractViolation):
         self.args = (self.actual,)
 
 
+class LateReply(NoReply):
+    """The reply came after its time, delayed on the way, by this machine or by the amplifier."""
+
+
 class AlreadyArmed(ContractViolation):
     """The amplifier is armed already, perhaps by another host: nothing is driven."""
 

@@ -16,6 +16,7 @@ from era_haptics.lab.conformance.outcomes import (
     AlreadyArmed,
     CheckOutcome,
     ContractViolation,
+    LateReply,
     NotApplicable,
     TooLate,
     UntimedClock,
@@ -147,12 +148,14 @@ class ConformanceRun:
             lateness.start_attempt()
             attempt = await self._attempt(check)
             is_late = isinstance(attempt.outcome, TooLate)
-            # A violation seen while something is late counts only if it is seen repeatedly.
+            # A violation seen while something is late counts only if it is seen repeatedly; a late
+            # reply never does while this machine is late itself.
             is_violation = isinstance(attempt.outcome, ContractViolation)
             is_doubtful = is_violation and lateness.is_disturbing
             doubtful_violations += is_doubtful
-            is_seldom_seen = doubtful_violations < FEW and not lateness.slow_reply
-            is_unconfirmed = is_doubtful and is_seldom_seen
+            is_delayed = isinstance(attempt.outcome, LateReply) and lateness.is_machine_late
+            is_seldom_seen = doubtful_violations < FEW or is_delayed
+            is_unconfirmed = is_doubtful and is_seldom_seen and not lateness.slow_reply
             if attempt.obstacle or not (is_late or is_unconfirmed):
                 return attempt
             if not lateness.repeats(started_at):

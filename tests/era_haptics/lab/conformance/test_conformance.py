@@ -602,6 +602,24 @@ async def test_reply_delayed_on_the_way_is_no_violation() -> None:
     assert ON_THE_WAY in result.reason
 
 
+@in_virtual_time
+async def test_late_reply_on_a_late_machine_is_no_violation() -> None:
+    """Every attempt gets one Status 600 ms late while this machine is late too: no verdict."""
+    with closing(JudgedLine("serial", varied())) as line:
+
+        async def read_late(subject: Subject) -> None:
+            await subject.request("GetStatus")
+            line.client.lateness.lag = 0.1
+            line.due = asyncio.get_running_loop().time() + 0.6
+            await subject.request("GetStatus")
+
+        check = ConformanceCheck("late", "passes", "", drives=False, kinds=(), steps=read_late)
+        result = await ConformanceRun(line.client, 0.2).check(1, check)
+
+    assert isinstance(result.outcome, TooLate), result
+    assert ON_THE_WAY in result.reason
+
+
 @pytest.mark.parametrize("size", shortly([1, 3, 8, 64], [1, 8]))
 def test_rtu_response_can_arrive_in_pieces(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tag 65535 and zeros behind it are a valid frame of unit 255 inside a response."""

@@ -329,7 +329,7 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     expect_instance(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
         raise InputError("an answer must have a layer to be drawn, got one with quiet fingers only")
-    return contents_figure(table, answer.layers, answer.promised_fingers)
+    return contents_figure(table, answer.layers, answer.promised_fingers, are_promised=True)
 
 
 def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":

@@ -266,7 +266,7 @@ class PlayResult(ApiMessage):
     """predicted level on the nominal plate, relative to the rig's threshold set; over the duration
     of a short vibration, onset included"""
     promised_level_db_sl: float | None = None
-    """level that 90 % of plates within the rig's tolerances reach"""
+    """at least this level on 90 % of plates within the rig's tolerances"""
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     verdict: Literal["own", "mixed", "shared"] | None = None
     """as in the status"""

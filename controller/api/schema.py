@@ -16,8 +16,8 @@ API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""
 
 PROMISED = (
-    "felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's "
-    "tolerances reach; null for a single finger"
+    "felt contrast, target over loudest quiet finger: at least this on 90 % of plates within the "
+    "rig's tolerances; null for a single finger"
 )
 """Description of the promised contrast."""
 
@@ -228,8 +228,10 @@ class ContactStatus(ApiMessage):
     """target: feels the pattern; quiet: kept quiet; hand: a resting hand, and surplus: a finger
     beyond max_fingers, which count only as loads; null before the first decision"""
     level_db_sl: float | None = None
-    """predicted level of a target relative to the rig's threshold set (`threshold` of `status`);
-    null if unknown"""
+    """level of a target relative to the rig's threshold set (`threshold` of `status`): at least
+    this if its vibration continues, on the nominal plate if it is short; null if unknown"""
+    promised_level_db_sl: float | None = None
+    """at least this level on 90 % of plates within the rig's tolerances"""
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     contrast_db: float | None = None
     """predicted felt contrast, target over loudest quiet finger; null for a single finger"""

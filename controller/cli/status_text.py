@@ -121,7 +121,9 @@ def _contact_line(contact: ContactStatus) -> str:
         f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
         f"{contact.role or 'not driven'}"
     )
-    if contact.level_db_sl is not None:
+    if contact.promised_level_db_sl is not None:
+        line += f" at least {contact.promised_level_db_sl:.1f} dB SL"
+    elif contact.level_db_sl is not None:
         line += f" {contact.level_db_sl:.1f} dB SL"
     if contact.promised_contrast_db is not None:
         line += f", at least {contact.promised_contrast_db:.1f} dB over the others"

@@ -164,6 +164,7 @@ def _figures(target: FingerSensation) -> dict[str, object]:
     return {
         "feels": target.content_name,
         "level_db_sl": finite(target.level_db_sl),
+        "promised_level_db_sl": finite(target.promised_level_db_sl),
         "promised_contrast_db": finite(sensation.promised_contrast_db),
         "contrast_db": finite(sensation.contrast_db),
         "verdict": sensation.verdict,

@@ -256,6 +256,11 @@ class FingerSensation:
         return own_level_db_sl(self.sensation)
 
     @property
+    def promised_level_db_sl(self) -> float | None:
+        """Promised level of the content; None without a content."""
+        return None if self.content is None else self.sensation.promised_level_db_sl
+
+    @property
     def frequency(self) -> float | None:
         """Frequency of the content [Hz]; None if it has several, or without a content."""
         if self.content is None:

@@ -108,7 +108,7 @@ export interface StatusResult {
   drive: Record<string, PlayedTone>;
   /** tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
   layers?: Record<string, Record<string, PlayedTone>>;
-  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
+  /** felt contrast, target over loudest quiet finger: at least this on 90 % of plates within the rig's tolerances; null for a single finger */
   promised_contrast_db?: number | null;
   /** the same on the nominal plate */
   predicted_contrast_db?: number | null;
@@ -269,9 +269,9 @@ export interface PlayResult {
   frequency_hz?: number | null;
   /** predicted level on the nominal plate, relative to the rig's threshold set; over the duration of a short vibration, onset included */
   level_db_sl?: number | null;
-  /** level that 90 % of plates within the rig's tolerances reach */
+  /** at least this level on 90 % of plates within the rig's tolerances */
   promised_level_db_sl?: number | null;
-  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
+  /** felt contrast, target over loudest quiet finger: at least this on 90 % of plates within the rig's tolerances; null for a single finger */
   promised_contrast_db?: number | null;
   /** as in the status */
   verdict?: "own" | "mixed" | "shared" | null;
@@ -332,7 +332,7 @@ export interface PatternEvent {
   drive: Record<string, PlayedTone>;
   /** tones of each vibration by layer, then by ERA, in the format of `drive`; an ERA plays the sum of its layers */
   layers?: Record<string, Record<string, PlayedTone>>;
-  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
+  /** felt contrast, target over loudest quiet finger: at least this on 90 % of plates within the rig's tolerances; null for a single finger */
   promised_contrast_db?: number | null;
   /** the same on the nominal plate */
   predicted_contrast_db?: number | null;
@@ -422,9 +422,11 @@ export interface ContactStatus {
   y_m: number;
   /** target: feels the pattern; quiet: kept quiet; hand: a resting hand, and surplus: a finger beyond max_fingers, which count only as loads; null before the first decision */
   role?: "target" | "quiet" | "hand" | "surplus" | null;
-  /** predicted level of a target relative to the rig's threshold set (`threshold` of `status`); null if unknown */
+  /** level of a target relative to the rig's threshold set (`threshold` of `status`): at least this if its vibration continues, on the nominal plate if it is short; null if unknown */
   level_db_sl?: number | null;
-  /** felt contrast, target over loudest quiet finger, that 90 % of plates within the rig's tolerances reach; null for a single finger */
+  /** at least this level on 90 % of plates within the rig's tolerances */
+  promised_level_db_sl?: number | null;
+  /** felt contrast, target over loudest quiet finger: at least this on 90 % of plates within the rig's tolerances; null for a single finger */
   promised_contrast_db?: number | null;
   /** predicted felt contrast, target over loudest quiet finger; null for a single finger */
   contrast_db?: number | null;

@@ -238,7 +238,7 @@ def query(
         *_rows_of_layers(answer),
         *_rows_of_fingers(answer, table.threshold_sets),
         *_rows_of_measures(answer),
-        f"promised: what 90 % of plates within the rig's uncertainty give ({table.uncertainty})",
+        f"≥ and ≤ hold for 90 % of plates within the rig's uncertainty ({table.uncertainty})",
         f"solved in {1000 * answer['solve_time_s']:.1f} ms",
     ]
     print_report(rows, answer, as_json=as_json)
@@ -288,7 +288,7 @@ def _rows_of_fingers(answer: dict[str, Any], threshold_sets: Sequence[str]) -> I
     from model.finger import scale_in_words
 
     yield f"{scale_in_words(threshold_sets[0])}; contrasts are the lowest over all threshold sets"
-    yield "finger [m]         frequency       level    contrast  nominal  foreign level    exposure"
+    yield "finger [m]         frequency     level ≥  contrast ≥  nominal      foreign ≤    exposure"
     for finger in answer["fingers"]:
         layer = finger["layer"]
         frequency = None if layer is None else answer["layers"][layer]["frequency_hz"]
@@ -302,7 +302,7 @@ def _rows_of_fingers(answer: dict[str, Any], threshold_sets: Sequence[str]) -> I
             f"{verdict_shown(finger['verdict'], is_foreign_felt=finger['is_foreign_felt'])}"
         )
     if answer["promised_worst_db"] is not None:
-        yield f"worst finger: {answer['promised_worst_db']:.1f} dB promised"
+        yield f"worst finger: at least {answer['promised_worst_db']:.1f} dB"
     for line in answer["applied"]:
         yield f"changed: {line}"
 

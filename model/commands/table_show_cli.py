@@ -43,9 +43,8 @@ def show(
     table = load_table(table_file)
     with Stopwatch() as timed, progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
-        costs = costs_of_tolerances(table)
+        costs_db = costs_of_tolerances(table)
     cells = overview.cells
-    costs_db = {} if costs is None else dict(costs.costs_db)
     summary = summarize(table, overview) | {"tolerance_costs_db": costs_db}
     length, width, _ = summary["plate_m"]
     target = f"{0.25 * length:.3g},{0.25 * width:.3g}"

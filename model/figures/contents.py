@@ -44,12 +44,17 @@ _MIN_PATCH_SHARE = 0.015  # of the plate; smaller patches have no label
 
 
 def contents_figure(
-    table: LocalizationTable, contents: Sequence[Layer], fingers: Sequence[Sensation]
+    table: LocalizationTable,
+    contents: Sequence[Layer],
+    fingers: Sequence[Sensation],
+    *,
+    are_promised: bool = False,
 ) -> Figure:
     """Draw a panel with all contents and one for each, as the table predicts them.
 
     Verdict, level and contrast are printed next to every finger, and frequencies in every large
-    patch without its own finger, since colors alone are not enough for every reader.
+    patch without its own finger, since colors alone are not enough for every reader. are_promised:
+    whether levels and contrasts are lower bounds.
     """
     count = len(contents)
     levels = np.array([_levels(table, layer) for layer in contents])
@@ -65,7 +70,8 @@ def contents_figure(
     main.set_title(
         "Color: a finger feels its own content. Gray: contents mix.", fontsize=TITLE_TEXT
     )
-    labels = [_label_finger(main, finger, contents) for finger in fingers]
+    bound = "≥ " if are_promised else ""
+    labels = [_label_finger(main, finger, contents, bound) for finger in fingers]
     _label_patches(main, table, levels, contents, fingers)
     for number, layer in enumerate(contents):
         axes = panels[f"{number}"]
@@ -243,8 +249,10 @@ class _FingerLabel(Annotation):
         return Bbox(corners)
 
 
-def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> _FingerLabel:
-    """Write verdict, level and contrast next to a finger."""
+def _label_finger(
+    axes: Axes, finger: Sensation, contents: Sequence[Layer], bound: str
+) -> _FingerLabel:
+    """Write verdict, level and contrast next to a finger; bound: sign before both figures."""
     words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
     lines = [str(words)]
     if finger.layer is not None:
@@ -252,7 +260,7 @@ def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> _
         levels = {"SL": finger.level_db_sl, "above the others": finger.contrast_db}
         for reference, level in levels.items():
             if level is not None and math.isfinite(level):
-                lines.append(f"{level:.0f} dB {reference}")
+                lines.append(f"{bound}{level:.0f} dB {reference}")
     label = _FingerLabel(axes, finger, lines)
     axes.add_artist(label)
     return label

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from model.finger import FELT_DB_SL, highest_measured
 from model.processes import Progress, unseen
 from model.study.contact_sets import random_contacts
 from model.study.weak_cells import (
+    MAX_GRID,
     Contrasts,
     WeakCells,
     ask_once,
@@ -37,6 +39,24 @@ class Overview:
     """Promised and nominal felt contrast (2, sets) [dB] to one, two and three other fingers."""
 
 
+def promised_to_another(table: LocalizationTable) -> float | None:
+    """Return the promised contrast of a finger to another [dB]; None if no pair reaches the level.
+
+    The definition of this figure in all commands, pages and pictures: the median over targets at
+    the centers of 8 by 6 cells with another finger at random positions (`pair_questions`), at 20 dB
+    SL, in the table's drive mode.
+    """
+    ask = ask_once(table)
+    answers = [ask(question) for question in _common_pairs(table)]
+    promised, _ = contrasts_reached(answers)
+    return float(np.median(promised)) if len(promised) else None
+
+
+def _common_pairs(table: LocalizationTable) -> list[Placement]:
+    """Return pairs of fingers that do not depend on the grid of a table."""
+    return list(chain.from_iterable(pair_questions(table, MAX_GRID)))
+
+
 def find_overview(
     table: LocalizationTable,
     *,
@@ -49,7 +69,7 @@ def find_overview(
     rng = np.random.default_rng(0)
     cell_questions = pair_questions(table)
     contact_sets = [set_questions(table, others=others, rng=rng) for others in (2, 3)]
-    groups = [*cell_questions, *contact_sets]
+    groups = [*cell_questions, _common_pairs(table), *contact_sets]
     total = sum(len(group) for group in groups)
     ask = ask_once(table)
     answered: list[list[Contrasts | None]] = []
@@ -58,8 +78,8 @@ def find_overview(
         progress(sum(len(answers) for answers in answered), total)
     cell_count = len(cell_questions)
     weak = find_weak_cells(table, answered[:cell_count])
-    of_sets = [contrasts_reached(answers) for answers in answered[cell_count:]]
-    return Overview(weak, [weak.pairs_db, *of_sets])
+    contrasts = [contrasts_reached(answers) for answers in answered[cell_count:]]
+    return Overview(weak, contrasts)
 
 
 def set_questions(

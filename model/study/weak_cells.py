@@ -52,7 +52,8 @@ _PERCENTILES = (50, 10)
 _DECIMALS = 9  # of positions [m]: smaller differences are rounding errors
 
 # Weak areas are as large as a quarter of a wavelength.
-_MAX_GRID = Grid(8, 6)
+MAX_GRID = Grid(8, 6)
+"""Finest grid of a map."""
 
 _REFLECTIONS: tuple[Reflection, ...] = ((False, False), (True, False), (False, True), (True, True))
 
@@ -103,7 +104,7 @@ class WeakCells:
 
 def map_grid(table: LocalizationTable) -> Grid:
     """Return the grid of the map: the table's, or a coarser one if the table's is fine."""
-    return Grid(min(table.grid.nx, _MAX_GRID.nx), min(table.grid.ny, _MAX_GRID.ny))
+    return Grid(min(table.grid.nx, MAX_GRID.nx), min(table.grid.ny, MAX_GRID.ny))
 
 
 def find_weak_cells(
@@ -148,14 +149,14 @@ def contrasts_reached(answered: Iterable[Contrasts | None]) -> FloatArray:
     return np.array(reached, dtype=float).reshape(-1, 2).T
 
 
-def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
-    """Return questions for each cell of `map_grid` as the target, with one other finger each.
+def pair_questions(table: LocalizationTable, grid: Grid | None = None) -> list[list[Placement]]:
+    """Return questions for each cell of a grid as the target, with one other finger each.
 
-    Positions of the other finger are drawn for each cell, at least MIN_DISTANCE away. They are the
-    same for cells that mirror each other if the plate is symmetric. A cell whose center is not on
-    the plate has no questions.
+    grid: `map_grid` by default. Positions of the other finger are drawn for each cell, at least
+    MIN_DISTANCE away. They are the same for cells that mirror each other if the plate is symmetric.
+    A cell whose center is not on the plate has no questions.
     """
-    grid, plate = map_grid(table), table.plate
+    grid, plate = grid or map_grid(table), table.plate
     images = mirror_images(table)
     is_symmetric_along_x = (True, False) in images
     is_symmetric_along_y = (False, True) in images

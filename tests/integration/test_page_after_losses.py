@@ -93,7 +93,9 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
         knob = {"name": "knob", "shape": "circle", "x_m": 0.1, "y_m": 0.1, "radius_m": 0.03}
         daemon.publish("layout", LayoutEvent(layout={"regions": [knob]}))
         await tab.until("document.querySelectorAll('.region').length === 1")
-        finger = ContactStatus(source="a", id=1, x_m=0.1, y_m=0.1, role="target", level_db_sl=18.0)
+        finger = ContactStatus(
+            source="a", id=1, x_m=0.1, y_m=0.1, role="target", promised_level_db_sl=18.0
+        )
         pattern = PatternEvent(
             contacts=[finger],
             drive={},
@@ -102,7 +104,7 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
             predicted_contrast_db=None,
         )
         daemon.publish("pattern", pattern)
-        await tab.until("document.querySelector('#summary').textContent.includes('18 dB SL')")
+        await tab.until("document.querySelector('#summary').textContent.includes('≥ 18 dB SL')")
         daemon.silence = UNCONFIRMED
         await tab.click("#stop")
         report = await tab.until(problem, lambda text: "side" in text)

@@ -3,7 +3,7 @@
 import { Connection } from "./connection.js";
 import { colourOf, decodeField, FieldView } from "./field.js";
 import { Fingers } from "./fingers.js";
-import { atLeast, felt, fixed, PlateOverlay } from "./plate.js";
+import { atLeast, felt, fixed, levelOf, PlateOverlay } from "./plate.js";
 import { addEvent, annotate, showAmplifiers, showEffects, showLatency, showLayouts, showStrengths, timeOfDay } from "./side.js";
 
 const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "inputs", "strength"];
@@ -211,10 +211,10 @@ function summarise(text, isDrawn = false) {
 // Summarise what each finger feels, with the figures drawn on the plate; the reason for feeling nothing is not drawn.
 function summarisePattern({ contacts }) {
   const targets = contacts.filter(({ role }) => role === "target").map((contact) => {
-    const { verdict, frequency_hz, level_db_sl, promised_contrast_db, held_back } = contact;
+    const { verdict, frequency_hz, promised_contrast_db, held_back } = contact;
     if (verdict === "held back") return held_back;
     const contrast = promised_contrast_db === null ? "" : `, at least ${atLeast(promised_contrast_db)} dB above the others`;
-    return `${fixed(frequency_hz)} Hz ${felt(contact)}, ${fixed(level_db_sl)} dB SL${contrast}`;
+    return `${fixed(frequency_hz)} Hz ${felt(contact)}, ${levelOf(contact) ?? "– dB SL"}${contrast}`;
   });
   const isDrawn = contacts.every(({ verdict }) => verdict !== "held back");
   summarise(`${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${targets.join("; ")}`, isDrawn);

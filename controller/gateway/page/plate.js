@@ -22,6 +22,14 @@ export const fixed = (value, digits = 0) => (value === null || value === undefin
 // A promise is rounded down.
 export const atLeast = (value) => fixed(value === null ? null : Math.floor(value));
 
+const isKnown = (value) => value !== null && value !== undefined;
+
+// Level of a finger's vibration, null without one: a lower bound if it is promised.
+export const levelOf = ({ level_db_sl: level, promised_level_db_sl: promised }) => {
+  if (isKnown(promised)) return `≥ ${fixed(promised)} dB SL`;
+  return isKnown(level) ? `${fixed(level)} dB SL` : null;
+};
+
 // Verdict of a finger, with a note if other contents are also felt.
 export const felt = ({ verdict, is_foreign_felt }) => (verdict === "own" && is_foreign_felt ? "own, others faintly felt" : verdict);
 
@@ -195,14 +203,13 @@ export class PlateOverlay {
   }
 
   contact(contact) {
-    const { role, level_db_sl, frequency_hz, held_back, verdict, promised_contrast_db: promised } = contact;
+    const { role, frequency_hz, held_back, verdict, promised_contrast_db: promised } = contact;
     const ring = this.circle(contact, `contact ${role ?? ""}`, this.ringRadius);
     ring.setAttribute("data-role", role ?? "");
-    const isKnown = (value) => value !== null && value !== undefined;
     const layer = this.layerOf(contact);
     const rings = layer === undefined ? [ring] : [this.circle(contact, "halo", this.ringRadius), ring];
     if (layer !== undefined) ring.style.stroke = colourOf(layer);
-    const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : ["quiet", "hand", "surplus"].includes(role) ? role : "";
+    const above = levelOf(contact) ?? (["quiet", "hand", "surplus"].includes(role) ? role : "");
     let below = role === "target" && isKnown(promised) ? `≥ ${atLeast(promised)} dB above others` : "";
     if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${felt(contact)}${isKnown(promised) ? `, ≥ ${atLeast(promised)} dB` : ""}`;
     if (held_back && verdict) below = verdict;

@@ -31,7 +31,9 @@ def fingers_picture(report: RigReport) -> Figure | None:
     if report.answer is None:
         return None
     answer = report.answer
-    figure = contents_figure(report.table, answer.layers, answer.promised_fingers)
+    figure = contents_figure(
+        report.table, answer.layers, answer.promised_fingers, are_promised=True
+    )
     figure.set_figheight(min(figure.get_figheight(), _HIGHEST))
     return figure
 

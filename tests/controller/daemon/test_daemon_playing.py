@@ -396,6 +396,7 @@ async def test_play_returns_start_and_levels_as_the_status_reports_them() -> Non
             assert (hum.frequency_hz, hum.verdict) == (left.frequency_hz, left.verdict)
             assert hum.level_db_sl == left.level_db_sl
             assert hum.promised_contrast_db == left.promised_contrast_db
+            assert hum.promised_level_db_sl == left.promised_level_db_sl
             (other,) = hum.other_fingers
             assert (other.source, other.id) == (right.source, right.id)
             assert other.foreign_level_db_sl == right.foreign_level_db_sl

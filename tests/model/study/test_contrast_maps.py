@@ -25,6 +25,7 @@ from kit.plates import (
     smooth_table,
 )
 from kit.set_table import only
+from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import Point
 from model.cli import app
@@ -33,6 +34,7 @@ from model.finger import Grid
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study.contact_sets import random_contacts
+from model.study.overview import find_overview, summarize
 from model.study.promise_cost import (
     PromiseCost,
     clock_cost,
@@ -90,15 +92,29 @@ def test_only_uncertain_keys_cost_contrast() -> None:
         costs.append(costs_of_tolerances(table))
 
     exact, less, more = costs
-    assert exact.costs_db == {}
-    assert list(less.costs_db) == ["stiffness"]
-    assert 0 < less.costs_db["stiffness"] < more.costs_db["stiffness"]
-    without = less.promised_db + less.costs_db["stiffness"]
-    assert without == pytest.approx(exact.promised_db)
+    assert exact == {}
+    assert list(less) == ["stiffness"]
+    assert 0 < less["stiffness"] < more["stiffness"]
+
+
+def test_contrast_of_two_fingers_is_one_figure() -> None:
+    """In the overview of a table and in the check of its rig: the median of single queries."""
+    rig = smooth_rig()
+    table = build_table(rig, grid=Grid(6, 4))
+    contrasts = []
+    for questions in pair_questions(table, Grid(8, 6)):
+        for placed in questions:
+            contrasts.append(query(table, placed, 20.0).fingers[0].promised_contrast_db)
+
+    overview = summarize(table, find_overview(table))
+    costs = uncertainty_costs(rig)
+
+    assert costs.promised_db == pytest.approx(np.median(contrasts), abs=0.1)
+    assert overview["promised_contrast_1_quiet_median_db"] == costs.promised_db
 
 
 def test_check_lists_costs_of_tolerances_and_what_to_measure() -> None:
-    """Damping counts as a factor, of 1 if exact; the costs are those of the table up to 250 Hz."""
+    """Damping counts as a factor, of 1 if exact."""
     rig = replace(smooth_rig(), uncertainty=replace(Uncertainty.none(), damping=1.5, gain=0.1))
     costs = uncertainty_costs(rig)
 

@@ -103,9 +103,9 @@ class CheckedContent:
     """Interval of the levels [s]."""
     expected: FloatArray
     """Levels in the file (n,) [dB SL], RMS over 20 ms."""
-    given: FloatArray
+    felt: FloatArray
     """Levels felt at the finger (n,) [dB SL]."""
-    kept: FloatArray
+    kept_shares: FloatArray
     """Fraction of the time in which both levels agree, for delays of 0, 1, 2 ... steps."""
     sharpness_kept: float = 1.0
     """Fraction of the continuous part's energy that plays at about the file's frequency."""
@@ -130,12 +130,12 @@ class CheckedContent:
     @property
     def delay(self) -> float:
         """Delay of the plate [s] at which the most is kept."""
-        return self.step * best_of(self.kept)
+        return self.step * best_of(self.kept_shares)
 
     @property
     def kept_share(self) -> float:
         """Fraction of the time in which the felt level is within 3 dB of the file's, 0 to 1."""
-        return float(self.kept.max())
+        return float(self.kept_shares.max())
 
     def as_json(self) -> dict[str, Any]:
         """Return the JSON object of `era content check --json`."""
@@ -149,7 +149,7 @@ class CheckedContent:
             "lost": [*self.lost],
             "level_db_sl": {
                 "requested": _rounded(self.expected[::stride]),
-                "given": _rounded(self.given[::stride]),
+                "given": _rounded(self.felt[::stride]),
                 "step_s": stride * self.step,
             },
             "parts": [part.as_json() for part in self.parts],
@@ -162,9 +162,9 @@ def _rounded(levels: FloatArray) -> list[float | None]:
     return [round(level, 2) if math.isfinite(level) else None for level in levels.tolist()]
 
 
-def kept_shares(expected: FloatArray, given: FloatArray, count: int) -> FloatArray:
+def kept_shares(expected: FloatArray, felt: FloatArray, count: int) -> FloatArray:
     """Return the fraction of the time in which levels (n,) [dB] agree, for each delay (count,)."""
-    differences = [_differences(expected, given, delay) for delay in range(count)]
+    differences = [_differences(expected, felt, delay) for delay in range(count)]
     return np.asarray(np.mean(np.abs(differences) <= TOLERANCE_DB, axis=1))
 
 
@@ -176,13 +176,18 @@ def _is_counted(expected: FloatArray) -> NDArray[np.bool_]:
 def _differences(expected: FloatArray, felt: FloatArray, delay: int) -> FloatArray:
     """Return felt minus expected level [dB] at a delay in samples, where the file is loud."""
     is_counted = _is_counted(expected)
-    return np.asarray(np.roll(felt, -delay)[is_counted] - expected[is_counted])
+    advanced = np.roll(felt, -delay)
+    return np.asarray(advanced[is_counted] - expected[is_counted])
 
 
 def least_promise(parts: Sequence[Part]) -> float | None:
     """Return the lowest promised contrast of the parts [dB]; None without quiet fingers."""
-    contrasts = [part.sensation.promised_contrast_db for part in parts]
-    return min((contrast for contrast in contrasts if contrast is not None), default=None)
+    contrasts = []
+    for part in parts:
+        contrast = part.sensation.promised_contrast_db
+        if contrast is not None:
+            contrasts.append(contrast)
+    return min(contrasts, default=None)
 
 
 def check_content(
@@ -202,28 +207,44 @@ def check_content(
     rendition, parts, rate, accelerations = play_content(
         pattern, table, level_db_sl, at=at, quiet=quiet
     )
-    times = np.arange(len(accelerations)) / rate
-    felt_power = 2 * over_threshold(accelerations, rate, table.threshold) ** 2
-    by_point = [averaged(power, 1 / rate, SMOOTHING) for power in felt_power.T]
-    given = decibels(fingertip_weights(*at, table.plate) @ np.sqrt(by_point))
-    requested_power = 10 ** (requested_level(pattern, level_db_sl, times) / 10)
-    averaged_power = np.maximum(averaged(requested_power, 1 / rate, SMOOTHING), 0)
-    expected = decibels(np.sqrt(averaged_power))
-    kept = kept_shares(expected, given, int(MAX_DELAY * rate) + 1)
-    differences = _differences(expected, given, best_of(kept))
+    step = 1 / rate
+    expected = _expected_levels(pattern, level_db_sl, count=len(accelerations), rate=rate)
+    felt = _felt_levels(accelerations, rate, table, at)
+    shares = kept_shares(expected, felt, int(MAX_DELAY * rate) + 1)
+    differences = _differences(expected, felt, best_of(shares))
     lost = (*rendition.remarks, *_weaker(parts), *_off_level(differences))
     return CheckedContent(
         at=at,
         duration=rendition.duration,
         parts=parts,
         lost=lost,
-        step=1 / rate,
+        step=step,
         expected=expected,
-        given=given,
-        kept=kept,
+        felt=felt,
+        kept_shares=shares,
         sharpness_kept=rendition.sharpness_kept,
         out_of_band_share=pattern.out_of_band_share,
     )
+
+
+def _expected_levels(
+    pattern: Pattern, level_db_sl: float, *, count: int, rate: float
+) -> FloatArray:
+    """Return the levels in a file (count,) [dB SL], RMS over 20 ms, at a sample rate [Hz]."""
+    times = np.arange(count) / rate
+    power = 10 ** (requested_level(pattern, level_db_sl, times) / 10)
+    averaged_power = np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)
+    return np.asarray(decibels(np.sqrt(averaged_power)))
+
+
+def _felt_levels(
+    accelerations: FloatArray, rate: float, table: LocalizationTable, at: Point
+) -> FloatArray:
+    """Return the levels (n,) [dB SL] of accelerations (n, p) [m/s²] at a fingertip's points."""
+    power = 2 * over_threshold(accelerations, rate, table.threshold) ** 2
+    averaged_powers = [averaged(point_power, 1 / rate, SMOOTHING) for point_power in power.T]
+    weights = fingertip_weights(*at, table.plate)
+    return np.asarray(decibels(weights @ np.sqrt(averaged_powers)))
 
 
 def default_positions(plate: Plate, quiet: Sequence[Point] = ()) -> list[Point]:
@@ -231,7 +252,8 @@ def default_positions(plate: Plate, quiet: Sequence[Point] = ()) -> list[Point]:
     positions = []
     for length_share, width_share in DEFAULT_POSITIONS:
         position = (length_share * plate.length, width_share * plate.width)
-        if all(math.dist(position, quiet_position) > _MIN_DISTANCE for quiet_position in quiet):
+        distances = [math.dist(position, quiet_position) for quiet_position in quiet]
+        if min(distances, default=math.inf) > _MIN_DISTANCE:
             positions.append(position)
     return positions
 
@@ -254,8 +276,8 @@ def play_content(
     if quiet:
         rendition = rendition.smoothed()
     parts = tuple(_parts(rendition, table, at, quiet))
-    highest = max((part.frequency or 0.0 for part in parts), default=0.0)
-    rate = max(_MIN_RATE, _RATE_FACTOR * highest)
+    frequencies = [part.frequency or 0.0 for part in parts]
+    rate = max(_MIN_RATE, _RATE_FACTOR * max(frequencies, default=0.0))
     min_count = 2 * (rendition.duration + _AFTER) * rate
     count = _FAST_COUNTS[bisect_left(_FAST_COUNTS, min_count)]
     times = np.arange((count + 1) // 2) / rate
@@ -300,8 +322,8 @@ def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray)
         course = part.stimulus.course
         elapsed = times - part.start
         if course is None:
-            ends = np.searchsorted(elapsed, [0.0, CLICK_DURATION + layer.ramp])
-            during = slice(*ends)
+            start, end = np.searchsorted(elapsed, [0.0, CLICK_DURATION + layer.ramp])
+            during = slice(start, end)
             elapsed = elapsed[during]
             fall = rise(elapsed - CLICK_DURATION, layer.ramp)
             envelope = rise(elapsed, layer.ramp) - fall
@@ -328,9 +350,10 @@ def _weaker(parts: Sequence[Part]) -> Iterator[str]:
     """Describe the parts that are weaker than in the file."""
     continuous = [part for part in parts if part.stimulus.course]
     taps = [part for part in parts if not part.stimulus.course]
-    for kind, of_kind in (("continuous part", continuous), ("taps", taps)):
-        lowered = [part.sensation.lowered_db for part in of_kind]
-        count = np.count_nonzero(lowered)
+    for name, kind_parts in (("continuous part", continuous), ("taps", taps)):
+        losses_db = [part.sensation.lowered_db for part in kind_parts]
+        count = np.count_nonzero(losses_db)
         if count:
-            subject = kind if len(of_kind) == 1 else f"{count} of {len(of_kind)} {kind}"
-            yield f"{subject} up to {max(lowered):.1f} dB weaker: the plate's limit here"
+            total = len(kind_parts)
+            subject = name if total == 1 else f"{count} of {total} {name}"
+            yield f"{subject} up to {max(losses_db):.1f} dB weaker: the plate's limit here"

@@ -320,7 +320,7 @@ def _comparison_rows(
         taps = f"{felt_taps} of {max(len(pattern.transients), felt_taps)}"
         yield (
             f"{checked.duration:5.2f}  {percent_down(checked.kept_share):>10}  "
-            f"{percent_down(checked.sharpness_kept):>14}  {checked.given.max():6.1f} dB SL  "
+            f"{percent_down(checked.sharpness_kept):>14}  {checked.felt.max():6.1f} dB SL  "
             f"{f'{_span(tones)} Hz':12}  {taps:7}  {name}"
         )
     x, y = checked.at
@@ -572,7 +572,7 @@ def _lines(checked: "CheckedContent") -> Iterator[str]:
     count = round(checked.duration / checked.step)
     for samples in np.array_split(np.arange(count), min(_ROWS, count)):
         expected = checked.expected[samples].max()
-        felt = checked.given[samples + delay].max()
+        felt = checked.felt[samples + delay].max()
         since = checked.step * samples[0]
         until = checked.step * (samples[-1] + 1)
         yield f"{since:6.2f} {until:6.2f} {_level(expected)} {_level(felt)}"

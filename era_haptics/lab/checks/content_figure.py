@@ -73,7 +73,7 @@ def _draw_content(levels: Axes, tones: Axes, pattern: Pattern, checked: CheckedC
         ls="--",
         label="requested (band: ±3 dB)",
     )
-    levels.plot(times - checked.delay, checked.given, color=_FELT_COLOR, lw=1.5, label="felt")
+    levels.plot(times - checked.delay, checked.felt, color=_FELT_COLOR, lw=1.5, label="felt")
     levels.set_ylabel("level / dB SL")
     _draw_frequencies(tones, pattern, checked, times)
     tones.set_xlabel("time / s")

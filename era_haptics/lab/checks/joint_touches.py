@@ -93,18 +93,20 @@ def check_together(
     total = len(pairs) + len(triples)
     joint_touches = []
     worst_in_pairs: dict[str, dict[str, Point]] = {region.name: {} for region in touched}
-    for number, group in enumerate((*pairs, *triples)):
+    for number, pair in enumerate(pairs):
         progress(number, total)
-        if len(group) > 2:
-            group = tuple(_at_worst_of_pairs(group, worst_in_pairs))
-        joint_touch = _worst(simulator, group)
-        if joint_touch is None:
-            continue
-        joint_touches.append(joint_touch)
-        if len(group) == 2:
-            first, second = group
-            worst_in_pairs[first.name][second.name] = joint_touch.at[0]
-            worst_in_pairs[second.name][first.name] = joint_touch.at[1]
+        joint_touch = _worst(simulator, pair)
+        if joint_touch is not None:
+            joint_touches.append(joint_touch)
+            first, second = joint_touch.regions
+            first_position, second_position = joint_touch.at
+            worst_in_pairs[first][second] = first_position
+            worst_in_pairs[second][first] = second_position
+    for number, triple in enumerate(triples, start=len(pairs)):
+        progress(number, total)
+        joint_touch = _worst(simulator, _at_worst_of_pairs(triple, worst_in_pairs))
+        if joint_touch is not None:
+            joint_touches.append(joint_touch)
     progress(total, total)
     return joint_touches
 
@@ -114,12 +116,15 @@ def matrix_of(together: Sequence[JointTouch]) -> tuple[list[str], FloatArray]:
 
     Below the diagonal: pairs. Above: triples with the worst third region. NaN if not checked.
     """
-    names = [*dict.fromkeys(name for touch in together for name in touch.regions)]
+    names: list[str] = []
+    for touch in together:
+        names += [name for name in touch.regions if name not in names]
     matrix = np.full((len(names), len(names)), np.nan)
     for touch in together:
-        numbers = sorted(names.index(name) for name in touch.regions)
+        numbers = sorted(map(names.index, touch.regions))
         for low, high in combinations(numbers, 2):
-            cell = (high, low) if len(numbers) == 2 else (low, high)
+            is_pair = len(numbers) == 2
+            cell = (high, low) if is_pair else (low, high)
             matrix[cell] = np.fmin(matrix[cell], touch.worst_db)
     return names, matrix
 
@@ -133,8 +138,10 @@ def close_pairs(together: Sequence[JointTouch]) -> str:
         return ""
     rows = []
     for pair in close[:_MAX_NAMED]:
-        rows.append(f"{' with '.join(pair.regions)} {pair.worst_db:.1f} dB")
-    remainder = f" and {len(close) - _MAX_NAMED} more" if len(close) > _MAX_NAMED else ""
+        regions = " with ".join(pair.regions)
+        rows.append(f"{regions} {pair.worst_db:.1f} dB")
+    unnamed = len(close) - len(rows)
+    remainder = f" and {unnamed} more" if unnamed else ""
     return (
         f", but {len(close)} of {counted(len(pairs), 'pair')} of regions below "
         f"{MIN_CONTRAST_DB:g} dB together: {', '.join(rows)}{remainder}; move these regions apart, "
@@ -177,11 +184,16 @@ def _distant_positions(
     positions: list[Point] = []
     while candidates and len(positions) < _POSITIONS:
         if positions:
-            distances = [min(math.dist(at, other) for other in positions) for at in candidates]
+            distances = [_distance_to_nearest(at, positions) for at in candidates]
         else:
             distances = [-math.dist(at, center) for at in candidates]
         positions.append(candidates.pop(best_of(distances)))
     return positions
+
+
+def _distance_to_nearest(at: Point, positions: Sequence[Point]) -> float:
+    """Return the distance [m] from a point to the nearest of several positions."""
+    return min(math.dist(at, position) for position in positions)
 
 
 def _closest(
@@ -192,9 +204,11 @@ def _closest(
     sizes = []
     for group in candidates:
         centers = [touched.region.shape.center for touched in group]
-        sizes.append(sum(math.dist(*pair) for pair in combinations(centers, 2)))
-    smallest = sorted(range(len(sizes)), key=sizes.__getitem__)[:count]
-    return [candidates[number] for number in sorted(smallest)]
+        distances = [math.dist(*pair) for pair in combinations(centers, 2)]
+        sizes.append(sum(distances))
+    by_size = sorted(range(len(sizes)), key=sizes.__getitem__)
+    numbers = sorted(by_size[:count])
+    return [candidates[number] for number in numbers]
 
 
 def _at_worst_of_pairs(
@@ -204,10 +218,13 @@ def _at_worst_of_pairs(
     names = {touched.name for touched in group}
     at_worst = []
     for touched in group:
-        worst = worst_in_pairs[touched.name]
-        positions = [at for other, at in worst.items() if other in names]
-        distinct = [*dict.fromkeys(positions)]
-        at_worst.append(touched._replace(positions=distinct or touched.positions[:1]))
+        positions: list[Point] = []
+        for partner, position in worst_in_pairs[touched.name].items():
+            if partner in names and position not in positions:
+                positions.append(position)
+        if not positions:
+            positions = touched.positions[:1]
+        at_worst.append(touched._replace(positions=positions))
     return at_worst
 
 
@@ -223,27 +240,39 @@ def _worst(simulator: TouchSimulator, group: Sequence[_TouchedRegion]) -> JointT
         targets.append(replace(touched.target, key=key))
         if touched.region.is_protected:
             protected.add(key)
-    free = [replace(target, is_own=False) for target in targets]
-    steady = [replace(target, modulation_hz=None) for target in free]
-    combination = []
-    contrasts = []
-    for at in product(*(touched.positions for touched in group)):
-        if all(math.dist(*pair) >= _MIN_DISTANCE for pair in combinations(at, 2)):
-            worst_db = _answered(simulator, _placed(steady, at), []).promised_worst_db
-            combination.append(at)
-            contrasts.append(math.inf if worst_db is None else worst_db)
-    if not combination:
+    free_targets = [replace(target, is_own=False) for target in targets]
+    worst_at = _worst_positions(simulator, group, free_targets)
+    if worst_at is None:
         return None
-    worst_at = combination[best_of([-contrast for contrast in contrasts])]
-    worst_db, felt = _felt(simulator, _placed(free, worst_at), None)
-    _, served = _felt(simulator, _placed(targets, worst_at), frozenset(protected))
+    worst_db, all_contents = _felt(simulator, _placed(free_targets, worst_at), None)
+    _, served_contents = _felt(simulator, _placed(targets, worst_at), frozenset(protected))
     return JointTouch(
-        tuple(touched.name for touched in group),
-        worst_at,
-        tuple(finger.contrast_db for finger in felt),
-        worst_db,
-        tuple(finger.verdict for finger in served),
+        regions=tuple(touched.name for touched in group),
+        at=worst_at,
+        contrasts=tuple(content.contrast_db for content in all_contents),
+        worst_db=worst_db,
+        verdicts=tuple(content.verdict for content in served_contents),
     )
+
+
+def _worst_positions(
+    simulator: TouchSimulator, group: Sequence[_TouchedRegion], targets: Sequence[Target]
+) -> tuple[Point, ...] | None:
+    """Return the positions with the lowest contrast of steady effects; None if fingers never
+    fit."""
+    steady = [replace(target, modulation_hz=None) for target in targets]
+    placements = []
+    scores = []
+    for at in product(*(touched.positions for touched in group)):
+        distances = [math.dist(*pair) for pair in combinations(at, 2)]
+        if min(distances) < _MIN_DISTANCE:
+            continue
+        worst_db = _answered(simulator, _placed(steady, at), []).promised_worst_db
+        placements.append(at)
+        scores.append(-math.inf if worst_db is None else -worst_db)
+    if not scores:
+        return None
+    return placements[best_of(scores)]
 
 
 def _placed(targets: Sequence[Target], at: Sequence[Point]) -> list[FingerTarget]:

@@ -13,8 +13,8 @@ from drivers.errors import CommandRefused as CommandRefused
 from drivers.errors import DriverError as DriverError
 from drivers.errors import LinkError as LinkError
 from era_haptics.drive import Drive as Drive
+from era_haptics.lab.design.assessment import Assessment as Assessment
 from era_haptics.lab.design.design_run import design as design
-from era_haptics.lab.design.results import Assessment as Assessment
 from era_haptics.lab.design.results import Design as Design
 from era_haptics.lab.design.results import RankedLayout as RankedLayout
 from era_haptics.lab.rig_page.html_page import page as page

@@ -4,7 +4,6 @@ A layout is evaluated in full by querying its localization table at contact sets
 used. `design` checks the arguments, then searches or ranks layouts.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -13,31 +12,30 @@ from typing import Any
 
 import numpy as np
 
+from era_haptics.lab.design.assessment import Assessment, assess
 from era_haptics.lab.design.contact_rule import contact_rule
+from era_haptics.lab.design.design_arguments import (
+    checked_stiffnesses,
+    expect_kept,
+    expect_real_numbers,
+    expect_whole_numbers,
+)
 from era_haptics.lab.design.era_area import EDGE, area_of
 from era_haptics.lab.design.given_layouts import NamedLayouts, supported_layouts
 from era_haptics.lab.design.layout_search import LayoutSearch, ScoredLayout
 from era_haptics.lab.design.problem import DEFAULT_ERA_GAP, DEFAULT_LOWEST, DesignProblem
-from era_haptics.lab.design.results import Assessment, Design, RankedLayout
+from era_haptics.lab.design.results import Design, RankedLayout
 from era_haptics.lab.design.runner import LayoutListener, Machines, Runner, ignore_layout
-from model.answer.plan import answer
-from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray, best_by, best_first
 from model.errors import (
-    MAX_VALUE,
     InputError,
-    expect_between,
     expect_instance,
-    expect_number,
     expect_path,
     is_whole,
-    shown,
 )
 from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
 from model.rig.rig import Rig
-from model.structure.statics import MIN_RIGID_BODY_FREQUENCY, support_problem
-from model.table.table import LocalizationTable
-from model.table.table_file import build_table
+from model.structure.statics import support_problem
 
 SENSITIVITY_STEP = 0.005
 """Displacement of an ERA [m] for the sensitivity to its position."""
@@ -47,8 +45,6 @@ DEFAULT_FINALISTS = 5
 
 CHUNK = 100
 """Given layouts scored per task, about a second of work."""
-
-MAX_STIFFNESSES, MAX_ERAS = 9, 32
 
 _search_of = lru_cache(maxsize=4)(LayoutSearch)
 
@@ -105,7 +101,7 @@ def design(
     expect_instance(counts, Sequence, what="eras", made_by="range(3, 7)")
     expect_instance(keep, Sequence, what="keep", made_by='["SW"]')
     expect_instance(stiffness, Sequence, what="stiffness", made_by="[17e3]")
-    _expect_whole_numbers(
+    expect_whole_numbers(
         {
             "contents": (contents, 1),
             "finalists": (finalists, 1),
@@ -115,71 +111,35 @@ def design(
         },
         counts,
     )
-    _expect_numbers(apart, lowest, stiffness)
+    expect_real_numbers(apart, lowest, stiffness)
     if not 0 < apart < max(rig.plate.length, rig.plate.width):
         raise InputError(f"apart must be above 0 and below the plate's length, got {apart:g} m")
-    _expect_kept(rig, keep, min(counts))
-    stiffnesses = _checked_stiffnesses(stiffness) or [None]
+    expect_kept(rig, keep, min(counts))
+    stiffnesses = checked_stiffnesses(stiffness) or [None]
     contacts_path = None if contacts is None else expect_path(contacts, what="contacts")
     rule = contact_rule(contacts_path, rig.plate, contents)
     area = area_of(str(expect_path(where, what="where")), rig.plate)
-    fixed = (area, rule, tuple(keep), float(apart), float(lowest), seed)
     problems = []
     for count in counts:
         for value in stiffnesses:
-            problems.append(DesignProblem(rig, count, *fixed, stiffness=value))
+            problem = DesignProblem(
+                rig=rig,
+                count=count,
+                area=area,
+                contacts=rule,
+                kept=tuple(keep),
+                apart=float(apart),
+                lowest=float(lowest),
+                seed=seed,
+                stiffness=value,
+            )
+            problems.append(problem)
     runner = Runner(_machines_of(workers, cluster), progress, on_layout)
     if layouts is None:
         return search_layouts(problems, starts=starts, runner=runner)
     layouts_text = str(expect_path(layouts, what="layouts"))
     given_layouts = supported_layouts(layouts_text, problems)
     return rank_layouts(given_layouts, finalists=finalists, runner=runner)
-
-
-def _expect_whole_numbers(numbers: Mapping[str, tuple[Any, int]], counts: Sequence[Any]) -> None:
-    """Raise InputError unless numbers of ERAs, and others with a minimum, are whole numbers."""
-    for count in (*counts, len(counts)):
-        _expect_whole_number("eras", count, 1, MAX_ERAS)
-    for name, (value, minimum) in numbers.items():
-        _expect_whole_number(name, value, minimum, MAX_VALUE)
-
-
-def _expect_whole_number(name: str, value: Any, minimum: int, maximum: float) -> None:
-    if not is_whole(value):
-        raise InputError(f"{name} must be a whole number, got {shown(value)}")
-    expect_between(value, minimum, maximum, what=name)
-
-
-def _expect_numbers(apart: float, lowest: float, stiffness: Sequence[float]) -> None:
-    """Raise InputError unless lengths, frequencies and stiffnesses are numbers."""
-    expect_number(apart, what="apart", unit="metres")
-    expect_number(lowest, what="lowest", unit="hertz")
-    for value in stiffness:
-        expect_number(value, what="stiffness", unit="newtons per meter")
-    expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
-
-
-def _expect_kept(rig: Rig, keep: Sequence[str], max_count: int) -> None:
-    """Raise InputError unless kept ERAs are different ERAs of the rig."""
-    names = [era.name for era in rig.eras]
-    is_wrong = any(name not in names or keep.count(name) > 1 for name in keep)
-    if is_wrong or len(keep) > max_count:
-        raise InputError(
-            f"keep must be up to {max_count} different ERAs of the rig, {', '.join(names)}, got "
-            f"{', '.join(map(str, keep))}"
-        )
-
-
-def _checked_stiffnesses(stiffness: Sequence[float]) -> list[float | None]:
-    """Return stiffnesses, ascending; raises InputError for values that repeat or are not above
-    0."""
-    values = sorted({float(value) for value in stiffness if 0 < value < math.inf})
-    if len(values) < len(stiffness) or len(values) > MAX_STIFFNESSES:
-        raise InputError(
-            f"stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
-            f"{', '.join(f'{value:g}' for value in stiffness)}"
-        )
-    return [*values]
 
 
 def _machines_of(workers: int | None, cluster: str | None) -> Machines:
@@ -283,14 +243,15 @@ def _assembled(
     if support_problem(rig.plate, rig.eras, loads=rig.masses) is None:
         (own,) = runner.run(_answer_sets, [problem], [(0, None)])
     search = _search_of(problem)
+    sensitivities = search.sensitivities(best.found.positions, step=SENSITIVITY_STEP)
     return Design(
-        (best, *dict.fromkeys(without_best)),
-        tuple(starts),
-        dict(sorted(by_count.items())),
-        dict(sorted(by_stiffness.items())),
-        search.sensitivities(best.found.positions, step=SENSITIVITY_STEP),
-        own,
-        problem.judged_sets(),
+        layouts=(best, *dict.fromkeys(without_best)),
+        starts=tuple(starts),
+        by_count=dict(sorted(by_count.items())),
+        by_stiffness=dict(sorted(by_stiffness.items())),
+        sensitivities=sensitivities,
+        own=own,
+        sets=problem.judged_sets(),
     )
 
 
@@ -346,28 +307,3 @@ def _answer_sets(
     problem = problems[number]
     rig = problem.rig if positions is None else problem.rig_with(positions)
     return assess(rig, problem.judged_sets(), contents=problem.contacts.contents)
-
-
-def assess(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
-    """Answer contact sets (fingers, 2) [m], fingers with contents first, with a rig's table.
-
-    Contents are at STRONG_DB_SL, or at the highest level found if that cannot be reached; none is
-    shared or held back. Raises InputError for ERAs that do not support the plate.
-    """
-    table = build_table(rig)
-    answers = [_answer_set(table, contacts, contents) for contacts in sets]
-    contrast, level = np.array(answers).T
-    quiet = np.array([len(contacts) - contents for contacts in sets])
-    return Assessment(quiet, contrast, level)
-
-
-def _answer_set(
-    table: LocalizationTable, contacts: FloatArray, contents: int
-) -> tuple[float, float]:
-    """Return the promised contrast [dB] and the level of the weakest content [dB SL]."""
-    positions = [(float(x), float(y)) for x, y in contacts]
-    fingers = [Finger(position, Stimulus()) for position in positions[:contents]]
-    result = answer(table, fingers, quiet=positions[contents:], min_contrast_db=-math.inf)
-    assert result.promised_worst_db is not None  # noqa: S101  a set has two fingers
-    level = min(sensation.promised_level_db_sl for sensation in result.fingers[:contents])
-    return result.promised_worst_db, level

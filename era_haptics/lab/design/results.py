@@ -2,62 +2,16 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from era_haptics.lab.design.assessment import Assessment
 from era_haptics.lab.design.layout_keys import layout_keys
 from era_haptics.lab.design.layout_search import ScoredLayout
 from era_haptics.lab.design.problem import DesignProblem
-from model.arrays import FloatArray, IntArray
+from model.arrays import FloatArray
 from model.config.document import Document
-from model.finger import STRONG_DB_SL
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.rig.rig_writing import document_for
 from model.structure.exciter import Actuator
-
-_LEVEL_MARGIN = 0.1  # dB
-
-
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """Answers for contact sets (s,), with the promised felt contrast [dB] of the worst finger.
-
-    quiet (s,): number of quiet fingers; level_db_sl (s,): promised level of the weakest content.
-    """
-
-    quiet: IntArray
-    contrast_db: FloatArray
-    level_db_sl: FloatArray
-
-    def __repr__(self) -> str:
-        return f"<Assessment of {len(self.quiet)} sets: {self.mean_db:.1f} dB>"
-
-    @property
-    def mean_db(self) -> float:
-        """Mean contrast [dB]; every number of quiet fingers has the same weight."""
-        means = [self.contrast_db[self.quiet == quiet].mean() for quiet in self.kinds]
-        return float(np.mean(means))
-
-    @property
-    def kinds(self) -> list[int]:
-        """Numbers of quiet fingers, ascending."""
-        return [int(quiet) for quiet in np.unique(self.quiet)]
-
-    def median_db(self, quiet: int) -> float:
-        """Median contrast [dB] with a number of quiet fingers."""
-        return float(np.median(self.contrast_db[self.quiet == quiet]))
-
-    @property
-    def summary(self) -> dict[str, float]:
-        """Return mean and medians [dB] for JSON."""
-        medians = {f"median_{quiet}_quiet": self.median_db(quiet) for quiet in self.kinds}
-        return {"mean": self.mean_db, **medians}
-
-    @property
-    def reached_share(self) -> float:
-        """Fraction of the sets in which all contents reach their level on 90 % of plates."""
-        is_reached = self.level_db_sl >= STRONG_DB_SL - _LEVEL_MARGIN
-        return float(is_reached.mean())
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,9 @@ import pytest
 
 from era_haptics.command import run_era
 from era_haptics.lab.design import problem as problem_module
+from era_haptics.lab.design.assessment import assess
 from era_haptics.lab.design.contact_rule import ContactRule, anywhere, contact_rule
-from era_haptics.lab.design.design_run import assess, rank_layouts
+from era_haptics.lab.design.design_run import rank_layouts
 from era_haptics.lab.design.era_area import Area, area_of, candidates_of, everywhere
 from era_haptics.lab.design.layout_keys import layout_keys
 from era_haptics.lab.design.layout_search import LayoutSearch

@@ -13,17 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from era_haptics.lab.measuring.clock_drift import check_clocks
 from era_haptics.lab.measuring.desk import Desk, converter_response
-from era_haptics.lab.measuring.multisine import PERIOD, Multisine, estimate, multisine_frequencies
-from era_haptics.lab.measuring.recording_checks import (
-    check_clocks,
-    check_coherence,
-    check_levels,
+from era_haptics.lab.measuring.loopback import (
     check_wiring,
     has_all_blocks,
     latency,
     loopback_gain,
 )
+from era_haptics.lab.measuring.multisine import PERIOD, Multisine, estimate, multisine_frequencies
+from era_haptics.lab.measuring.recording_checks import check_coherence, check_levels
 from era_haptics.lab.measuring.runs import TRIES, Run, play_and_record, run_time
 from era_haptics.lab.measuring.sensor_file import WiredSensor, read_sensors
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card

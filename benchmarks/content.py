@@ -89,7 +89,10 @@ def _print_alone(patterns: Sequence[Pattern]) -> bool:
             for each in (pattern, replace(pattern, transients=tuple(taps)))
         ]
         shares.append(
-            [np.interp(delays, each.step * np.arange(len(each.kept)), each.kept) for each in found]
+            [
+                np.interp(delays, each.step * np.arange(len(each.kept_shares)), each.kept_shares)
+                for each in found
+            ]
         )
     by_delay = np.array(shares)  # files, both, delays
     late = int(np.median(by_delay, axis=0)[0].argmax())

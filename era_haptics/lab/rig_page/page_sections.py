@@ -114,7 +114,8 @@ def advice(report: RigReport) -> str:
         return "None: tolerances are zero, or the plate is too small or too weak for two fingers."
     key, cost = next(iter(report.costs.items()))
     return (
-        "Increase of the promised contrast to a quiet finger if a tolerance were zero, on average. "
+        "Increase of the promised contrast to a quiet finger up to 250 Hz if a tolerance were zero, "
+        "on average. "
         "Measure first: "
         f"{tolerance_words(key, report.rig.uncertainty)}, which costs {cost:.1f} dB."
     )

@@ -61,10 +61,12 @@ class MeasuredResponses:
 
     def quality(self, sensor: int) -> dict[str, float]:
         """Return quality figures of the sensor with a given number, for JSON."""
+        coherence = self.coherence[:, sensor]
+        std = self.std[:, sensor]
         return {
-            "coherence_median": float(np.median(self.coherence[:, sensor])),
-            "coherence_min": float(self.coherence[:, sensor].min()),
-            "noise_relative": float(np.median(self.std[:, sensor])),
+            "coherence_median": float(np.median(coherence)),
+            "coherence_min": float(coherence.min()),
+            "noise_relative": float(np.median(std)),
             "square_law_relative": float(self.even[sensor]),
         }
 
@@ -180,7 +182,8 @@ def measure(
 
 def _rms_by_sensor(values: ComplexArray) -> FloatArray:
     """RMS over frequencies and ERAs of responses (f, sensors, ERAs), (sensors,)."""
-    return np.asarray(np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2))))
+    power = np.abs(values) ** 2
+    return np.asarray(np.sqrt(power.mean(axis=(0, 2))))
 
 
 def _play_runs(
@@ -216,11 +219,11 @@ def measure_at_once(
         measured = measure(desk, card, multisine, periods=periods, progress=progress)
     responses = measured.responses
     write_responses(output, responses, desk.rig)
-    lines = [
-        *_quality_lines(measured, rate=card.rate),
-        f"measured in {stopwatch.elapsed:.1f} s; wrote {output}",
-    ]
-    qualities = {name: measured.quality(number) for number, name in enumerate(responses.names)}
+    lines = [*_quality_lines(measured, rate=card.rate)]
+    lines.append(f"measured in {stopwatch.elapsed:.1f} s; wrote {output}")
+    qualities = {}
+    for number, name in enumerate(responses.names):
+        qualities[name] = measured.quality(number)
     return lines, {
         "frequencies_hz": responses.frequencies.tolist(),
         "latency_s": measured.latency,
@@ -234,10 +237,10 @@ def measure_at_once(
 def _quality_lines(measured: MeasuredResponses, *, rate: float) -> Iterator[str]:
     """Yield lines with the quality of responses."""
     frequencies = measured.responses.frequencies
+    delay = f"{1e3 * measured.latency:.3f} ms ({measured.latency * rate:.1f} samples)"
     yield (
         f"{len(frequencies)} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} Hz; delay "
-        f"of the sound card {1e3 * measured.latency:.3f} ms ({measured.latency * rate:.1f} "
-        f"samples); {measured.repeated} runs repeated for lost blocks"
+        f"of the sound card {delay}; {measured.repeated} runs repeated for lost blocks"
     )
     yield "sensor      coherence   lowest   noise    square law"
     for number, name in enumerate(measured.responses.names):
@@ -295,20 +298,28 @@ def measure_through(
         repeats.append(_repeats(desk, measured, scaled, run.whole))
         progress(multisine.sources + len(repeats), total)
     half_level, at_end = repeats
-    responses = measured.responses
-    noise = measured.std * _rms_by_sensor(responses.values)
-    noise_of_parts = noise[:, :, None] / np.sqrt(2)  # of the real and of the imaginary part
-    errors = np.hypot(responses.std, noise_of_parts)  # with the usual reading error
-    measurement = replace(responses, errors=errors, half_level=half_level, at_end=at_end)
-    sensors = enumerate(desk.sensors)
+    measurement = replace(
+        measured.responses, errors=_errors(measured), half_level=half_level, at_end=at_end
+    )
+    sensor_rows = []
+    for number, sensor in enumerate(desk.sensors):
+        sensor_rows.append(_sensor_row(sensor, measured.quality(number)))
     return MeasuredPlate(
         measurement,
         multisine.level,
         time.monotonic() - started_at,
-        sensors=tuple(_sensor_row(sensor, measured.quality(n)) for n, sensor in sensors),
+        sensors=tuple(sensor_rows),
         notes=(),
         details={"latency_s": measured.latency, "repeated_runs": measured.repeated},
     )
+
+
+def _errors(measured: MeasuredResponses) -> FloatArray:
+    """Return the standard deviations of real and imaginary parts: noise and reading error."""
+    responses = measured.responses
+    noise = measured.std * _rms_by_sensor(responses.values)
+    noise_of_parts = noise[:, :, None] / np.sqrt(2)
+    return np.asarray(np.hypot(responses.std, noise_of_parts))
 
 
 def _sensor_row(sensor: WiredSensor, quality: dict[str, float]) -> dict[str, Any]:
@@ -327,14 +338,18 @@ def _repeats(
 ) -> tuple[Repeat, ...]:
     """Compare the strongest lines of a run with the response to all ERAs together."""
     full_levels = list(desk.rig.full_levels.values())
-    bases = multisine.played(_REPEATED_RUN)[:, : len(full_levels)] * full_levels  # (f, eras)
+    played = multisine.played(_REPEATED_RUN)
+    bases = played[:, : len(full_levels)] * full_levels  # (f, eras)
     norms = np.linalg.norm(bases, axis=1, keepdims=True)
     expected = np.einsum("fse,fe->fs", measured.responses.values, bases) / norms
     samples = multisine.amplitudes_in(recorded)[:, desk.wiring.sensor_columns]
-    accelerations = samples / [sensor.sensitivity for sensor in desk.sensors]
-    repeated = accelerations / converter_response(measured.loopback)[:, None] / norms
+    sensitivities = [sensor.sensitivity for sensor in desk.sensors]
+    accelerations = samples / sensitivities
+    converters = converter_response(measured.loopback)[:, None]
+    repeated = accelerations / converters / norms
     names = ", ".join(desk.wiring.era_outputs)
-    strongest = best_first(np.linalg.norm(expected, axis=1))[:_COMPARED_LINES]
+    magnitudes = np.linalg.norm(expected, axis=1)
+    strongest = best_first(magnitudes)[:_COMPARED_LINES]
     repeats = []
     for line in strongest:
         frequency = float(multisine.frequencies[line])

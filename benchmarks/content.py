@@ -88,12 +88,11 @@ def _print_alone(patterns: Sequence[Pattern]) -> bool:
             check_content(each, table, LEVEL_DB_SL, at=AT)
             for each in (pattern, replace(pattern, transients=tuple(taps)))
         ]
-        shares.append(
-            [
-                np.interp(delays, each.step * np.arange(len(each.kept_shares)), each.kept_shares)
-                for each in found
-            ]
-        )
+        kept = []
+        for checked in found:
+            checked_delays = checked.step * np.arange(len(checked.kept_shares))
+            kept.append(np.interp(delays, checked_delays, checked.kept_shares))
+        shares.append(kept)
     by_delay = np.array(shares)  # files, both, delays
     late = int(np.median(by_delay, axis=0)[0].argmax())
     count = sum(len(each.transients) for each in patterns)

@@ -113,11 +113,10 @@ def advice(report: RigReport) -> str:
     if not report.costs:
         return "None: tolerances are zero, or the plate is too small or too weak for two fingers."
     key, cost = next(iter(report.costs.items()))
+    tolerance = tolerance_words(key, report.rig.uncertainty)
     return (
-        "Increase of the promised contrast to a quiet finger up to 250 Hz if a tolerance were zero, "
-        "on average. "
-        "Measure first: "
-        f"{tolerance_words(key, report.rig.uncertainty)}, which costs {cost:.1f} dB."
+        "Increase of the promised contrast to a quiet finger, up to 250 Hz and on average, if a "
+        f"tolerance were zero. Measure first: {tolerance}, which costs {cost:.1f} dB."
     )
 
 

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --editable
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test qemu-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages format docs fuzz faults mutants kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test qemu-test test test-changed test-long test-busy test-kernels test-pymodbus nightly lint weigh pages pictures format docs fuzz faults mutants kill-test fault-test stop-test late-test qt-test estimate-test surface-test soak bench bench-latency \
 	bench-promise dist kernels smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -107,6 +107,11 @@ weigh: .venv/installed-test
 PAGES := OPENBLAS_NUM_THREADS=1 $(BIN)/python docs/generators/pages.py
 pages: .venv/installed-test
 	$(PAGES)
+
+# The pictures that simulations draw, the moving one of the README among them; three minutes.
+pictures: .venv/installed-test
+	$(BIN)/python docs/generators/time_pictures.py docs/pictures
+	$(BIN)/python docs/generators/moving_picture.py docs/pictures/car_display.webp
 
 # A million damaged frames on every kind of line; `make test` takes a few thousand.
 fuzz: .venv/installed-test

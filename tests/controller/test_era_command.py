@@ -8,10 +8,13 @@ import io
 import json
 import logging
 import os
+import pty
+import select
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from importlib import import_module
@@ -28,6 +31,7 @@ from controller.process.daemon_process import SocketLock
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from model.errors import InputError
 from processes.gateways import wait_for
+from processes.installed import installed_program
 from processes.interrupted import full_disk
 from registry.command_line import LoadModules, run
 from registry.service_manager import ServiceManager
@@ -388,6 +392,72 @@ def test_bash_completes_commands_and_options(typed: str, words: set[str]) -> Non
     )
     assert done.stderr == ""
     assert {*done.stdout.split()} == words
+
+
+def install_completion(shell: str, home: Path) -> dict[str, str]:
+    """Run `era --install-completion` in a shell with a home of its own; return its environment."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = os.environ | {"HOME": str(home), "PATH": path, "TERM": "xterm"}
+    for name in ("ZDOTDIR", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        environment.pop(name, None)
+    command = [installed_program(shell), "-c", "era --install-completion; true"]
+    installed = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60)
+    assert f"{shell} completion installed in {home}" in installed.stdout
+    return environment
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [("era con", {"config", "content"}), ("era content check tick --qu", {"--quiet"})],
+)
+def test_fish_completes_commands_and_options(tmp_path: Path, typed: str, words: set[str]) -> None:
+    """After `era --install-completion`, by fish's own list of completions with descriptions."""
+    environment = install_completion("fish", tmp_path)
+    done = subprocess.run(
+        ["fish", "-c", f"complete -C '{typed}'"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=60,
+    )
+    assert {line.split("\t")[0] for line in done.stdout.splitlines()} == words
+
+
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [("era conf\t", "ig"), ("era content check tick --qu\t", "iet")],
+)
+def test_zsh_completes_commands_and_options(tmp_path: Path, typed: str, completed: str) -> None:
+    """After `era --install-completion`, typed with Tab in an interactive zsh on a terminal.
+
+    The first Tab of a session loads Typer's script and completes nothing.
+    """
+    environment = install_completion("zsh", tmp_path)
+    ours, theirs = pty.openpty()
+    shell = subprocess.Popen(
+        ["zsh", "-i"], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
+    )
+    os.close(theirs)
+    try:
+        read_until(ours, "\x1b[?2004h")  # the prompt accepts input
+        os.write(ours, typed.encode())
+        read_until(ours, "\a")  # the bell: nothing completed
+        os.write(ours, b"\t")
+        read_until(ours, completed)
+    finally:
+        shell.kill()
+        shell.wait()
+        os.close(ours)
+
+
+def read_until(terminal: int, expected: str, *, patience: float = 60) -> None:
+    """Read from a terminal until it has shown a text."""
+    shown = ""
+    deadline = time.monotonic() + patience
+    while expected not in shown:
+        ready, _, _ = select.select([terminal], [], [], max(deadline - time.monotonic(), 0))
+        assert ready, f"{expected!r} was not shown: {shown!r}"
+        shown += os.read(terminal, 4096).decode()
 
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:

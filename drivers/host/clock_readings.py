@@ -174,8 +174,12 @@ class ClockReadings:
         low = -math.inf
         high = math.inf
         for time, lead, max_delay in self._kept:
-            low = max(low, lead - max_delay - rate * time)
-            high = min(high, lead - MAX_CRYSTAL * time)
+            lowest = lead - max_delay - rate * time
+            if lowest > low:
+                low = lowest
+            highest = lead - MAX_CRYSTAL * time
+            if highest < high:
+                high = highest
         self._bounds = _LeadBounds(low, high, rate)
 
     def lower(self, off: float) -> None:

@@ -92,27 +92,30 @@ class _Moments(NamedTuple):
 
 
 def _moments(aged_leads: Sequence[tuple[float, float]]) -> _Moments:
-    """Return the moments of leads [s], which are given with their ages [s]."""
+    """Return the moments of leads [s], which are given with their ages [s].
+
+    Since sum(y - mean(y)) = 0, sum(z y) = sum(x^2 (y - mean(y))); and sum(z^2) is the sum of x^4
+    minus sum(x^2) mean(x^2).
+    """
     count = len(aged_leads)
-    mean_lead = mean_age = 0.0
+    lead_sum = age_sum = 0.0
     for lead, age in aged_leads:
-        mean_lead += lead / count
-        mean_age += age / count
-    xx = xy = yy = 0.0
+        lead_sum += lead
+        age_sum += age
+    mean_lead = lead_sum / count
+    mean_age = age_sum / count
+    xx = xy = yy = xxy = xxxx = 0.0
     for lead, age in aged_leads:
         x = mean_age - age
         y = lead - mean_lead
-        xx += x * x
+        square = x * x
+        xx += square
         xy += x * y
         yy += y * y
-    mean_xx = xx / count
-    zy = zz = 0.0
-    for lead, age in aged_leads:
-        x = mean_age - age
-        z = x * x - mean_xx
-        zy += z * lead
-        zz += z * z
-    return _Moments(mean_lead, mean_age, xx, xy, yy, zy, zz)
+        xxy += square * y
+        xxxx += square * square
+    zz = xxxx - xx * xx / count
+    return _Moments(mean_lead, mean_age, xx, xy, yy, xxy, zz)
 
 
 def aged_leads_of(readings: Iterable[Reading], time: float) -> list[tuple[float, float]]:

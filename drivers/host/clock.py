@@ -222,6 +222,13 @@ class HeldClock:
             return self._readings.fit.at(time)
         return leader.fit_at(time).plus(self._comparison.difference.at(time))
 
+    def _fit_error(self, time: float) -> float:
+        """Return the standard error of the lead of `fit_at` [s]."""
+        leader = self._comparison.compared_leader
+        if leader is None:
+            return self._readings.fit.error_at(time)
+        return leader._fit_error(time) + self._comparison.difference.error_at(time)
+
     def lead(self, time: float) -> float:
         """Return how far it is ahead of the host's clock at a time [s]; 0 before it is read."""
         return self._with_steering(self.fit_at(time), time)
@@ -232,7 +239,7 @@ class HeldClock:
 
     def scatter(self, time: float) -> float:
         """Return the standard error of its measured lead [s]; infinite if it must be read again."""
-        return math.inf if self._readings.is_doubted else self.fit_at(time).error
+        return math.inf if self._readings.is_doubted else self._fit_error(time)
 
     def error(self, time: float, *, off: float | None = None, is_common: bool = False) -> float:
         """Return its error [s rms], including the amplifier's specified error; infinite if unknown.
@@ -257,7 +264,7 @@ class HeldClock:
 
     def is_synchronized(self, time: float) -> bool:
         """Whether its error at a time [s] is known."""
-        return self._is_trusted(time) and self.fit_at(time).error < math.inf
+        return self._is_trusted(time) and self._fit_error(time) < math.inf
 
     def _is_trusted(self, time: float) -> bool:
         """Whether it can be steered, and has followed the host's clock until a time [s]."""
@@ -417,7 +424,7 @@ class HeldClock:
             time,
             max_early=time - self._sent_at,
             max_delay=max_delay,
-            error=self.fit_at(time).error,
+            error=self._fit_error(time),
             clock_error=self._max_reading_error,
         )
         match verdict:

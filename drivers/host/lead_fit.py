@@ -59,12 +59,17 @@ class LeadFit(NamedTuple):
         """Return the lead at a time [s] on the tangent, without the bend."""
         return self.offset + self.rate * (time - self.time)
 
+    def error_at(self, time: float) -> float:
+        """Return the standard error of the lead [s] on the tangent at a time [s]."""
+        elapsed = time - self.time
+        if elapsed <= 0.0:
+            return self.error
+        return self.error + self.rate_error * elapsed
+
     def at(self, time: float) -> "LeadFit":
         """Return the tangent with its coefficients at another time [s]."""
-        elapsed = time - self.time
-        offset = self.offset + self.rate * elapsed
-        error = self.error + self.rate_error * max(0.0, elapsed)
-        return LeadFit(time, offset, self.rate, 0.0, error, self.rate_error)
+        offset = self.on_line(time)
+        return LeadFit(time, offset, self.rate, 0.0, self.error_at(time), self.rate_error)
 
     def plus(self, difference: "LeadFit") -> "LeadFit":
         """Return the lead of a clock that differs from this one; both are for the same time."""

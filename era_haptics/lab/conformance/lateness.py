@@ -42,7 +42,12 @@ class Lateness:
 
     @property
     def slow_reply(self) -> str:
-        """Return which message it always answers too late, and by when; empty if none."""
+        """Return which message it always answers too late, and by when; empty if none.
+
+        None while this machine is late itself.
+        """
+        if self.is_machine_late:
+            return ""
         for name, reactions in self.reactions.items():
             shortest = min(reactions, default=0.0)
             if len(reactions) >= FEW and shortest > REACTION:

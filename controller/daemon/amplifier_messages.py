@@ -12,6 +12,7 @@ from controller.api.schema import (
 )
 from controller.daemon.plate_view import in_milliseconds
 from controller.operation.operation_states import Loss
+from drivers.by_hand.rows import silence_rows
 from drivers.host.amplifier import Amplifier
 from drivers.host.members import is_lost
 from drivers.host.requests import LinkStatistics
@@ -55,7 +56,7 @@ def amplifier_statuses(
         is_closed_with_lost = lost is not None and bool(lost.names) and name not in lost.names
         silence: AmplifierSilence | None = None
         if not has_status or is_degraded:
-            silence = AmplifierSilence(**what_may_play(name).rows(now))
+            silence = AmplifierSilence(**silence_rows(what_may_play(name), now))
         clock_skew_us: float | None = None
         clock_error = clock_errors.get(name, math.inf)
         if has_status and len(urls) > 1 and math.isfinite(clock_error):

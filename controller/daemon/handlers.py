@@ -56,6 +56,7 @@ from controller.operation.operation_states import (
 from controller.operation.plate_controller import Controller
 from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.sources.touch import Contact, Touch, TouchFrame
+from drivers.by_hand.rows import silence_rows
 from drivers.host.stops import StopOutcome
 from model.compiled.kernels import why_slow
 from model.structure.plate import Plate
@@ -470,7 +471,7 @@ async def _silence(stopping: Awaitable[Mapping[str, StopOutcome]], epoch: int) -
     amplifiers = {}
     is_silent = len(outcomes) > 0
     for name, outcome in outcomes.items():
-        amplifiers[name] = AmplifierSilence(**outcome.rows(now))
+        amplifiers[name] = AmplifierSilence(**silence_rows(outcome, now))
         is_silent = is_silent and outcome.is_confirmed
     if not is_silent:
         raise NotSilent(amplifiers)

@@ -20,7 +20,14 @@ from types import TracebackType
 from typing import Any
 
 from drivers.by_hand.reaching import identified, keep_alive, random_session, reached
-from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_rows, wire_rows
+from drivers.by_hand.rows import (
+    capability_rows,
+    fault_rows,
+    in_units,
+    silence_rows,
+    status_rows,
+    wire_rows,
+)
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.requests import Priority
@@ -116,7 +123,7 @@ async def stop(url: str) -> dict[str, Any]:
     except LinkError as error:
         cause = f"{error}; {_UNKNOWN}"
     outcome = StopOutcome(not cause, math.inf, cause)  # another host may feed it
-    return {"url": url, **outcome.rows(threads.now()), **rows}
+    return {"url": url, **silence_rows(outcome, threads.now()), **rows}
 
 
 async def _stop(amplifier: Amplifier) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 from drivers.host.amplifier import Amplifier
 from drivers.host.statuses import REPORTS, reports_of
+from drivers.host.stops import StopOutcome
 from drivers.protocol.definition import (
     CLOCK_UNKNOWN,
     FAULTS,
@@ -104,3 +105,18 @@ def wire_rows(amplifier: Amplifier) -> dict[str, Any]:
         "sets_per_second_max": math.floor(1 / set_time),
         "watchdog_shortest_s": round(shortest_watchdog(set_time), 6),
     }
+
+
+def silence_rows(outcome: StopOutcome, now: float) -> dict[str, Any]:
+    """Return the API fields `silence`, `may_play_for_s` and `cause` of a stop; now [s]."""
+    left = outcome.may_play_until - now
+    if outcome.is_confirmed:
+        silence = "confirmed_silent"
+    elif left > 0:
+        silence = "may_play"
+    else:
+        silence = "watchdog_elapsed"
+    may_play_for = None
+    if not outcome.is_confirmed and left < math.inf:
+        may_play_for = round(max(left, 0.0), 3)
+    return {"silence": silence, "may_play_for_s": may_play_for, "cause": outcome.cause}

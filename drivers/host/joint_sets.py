@@ -46,9 +46,9 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from registry import threads
 
-_TOKENS_PER_CHECK = 1 << 12  # number of tokens after which the gaps are checked again
-_MAX_GAP = 1 << 14  # tokens
 _TOKEN_SPAN = 1 << 16
+_MAX_GAP = 1 << 14  # tokens; with the tokens between two checks, below half of the span
+_TOKENS_BETWEEN_CHECKS = 1 << 12
 _WORD_STEP = AHEAD_MAX // 2  # between two high words that are tried
 
 
@@ -147,7 +147,7 @@ class JointSets:
     ) -> SetOutcome:
         """Stage, judge, commit and report sets; sets: in the order of staging."""
         epoch = self._members.epoch
-        if self.token % _TOKENS_PER_CHECK == 0:
+        if self._is_gap_check_due():
             await self._close_gaps()
         is_silent = all(is_silence(staged.requested) for staged in sets.values())
         is_immediate = is_silent or len(sets) == 1
@@ -291,6 +291,10 @@ class JointSets:
         for amplifier, status in zip(requests, statuses, strict=False):
             if status["token"] != token or status["state"] in LATCHED:
                 await _check_plays(amplifier, status, staged_sets[amplifier])
+
+    def _is_gap_check_due(self) -> bool:
+        """Whether so many sets have been sent that an amplifier's token may be far behind."""
+        return self.token % _TOKENS_BETWEEN_CHECKS == 0
 
     async def _close_gaps(self) -> None:
         """Let amplifiers whose token is far behind commit an empty set, which changes nothing."""

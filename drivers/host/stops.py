@@ -8,7 +8,7 @@ the watchdog and the last status.
 import asyncio
 import math
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 from drivers.host.line import Line
 from drivers.host.requests import Member, Priority
@@ -31,17 +31,6 @@ class StopOutcome:
     """Until when it may play [s]; infinite if nothing is known to silence it."""
     cause: str = ""
     """Why no more is known."""
-
-    def rows(self, now: float) -> dict[str, Any]:
-        """Return the API fields `silence`, `may_play_for_s` and `cause`; now [s]."""
-        left = self.may_play_until - now
-        silence = "may_play" if left > 0 else "watchdog_elapsed"
-        is_bounded = not self.is_confirmed and left < math.inf
-        return {
-            "silence": "confirmed_silent" if self.is_confirmed else silence,
-            "may_play_for_s": round(max(left, 0.0), 3) if is_bounded else None,
-            "cause": self.cause,
-        }
 
 
 UNREACHED = StopOutcome(False, math.inf, "it has not replied since the start")

@@ -192,10 +192,11 @@ class ChoicePhase(Enum):
 
 
 class ChoiceThread:
-    """Makes one choice at a time in a thread, and gives it up after a second.
+    """Makes one choice at a time in a thread, and gives it up after `TIME_LIMIT` (1 s).
 
-    The thread cannot be ended while it works, so no other choice begins before. arrived: called
-    when a choice can be taken, and when a choice that was given up has ended.
+    The thread cannot be ended while it works. Until a choice that was given up has ended, every
+    other choice is silence. arrived: called when a choice can be taken, and when a choice that was
+    given up has ended.
     """
 
     def __init__(self, arrived: Callable[[], None]) -> None:
@@ -213,8 +214,13 @@ class ChoiceThread:
 
     def start(
         self, chooser: Chooser, question: Question, capabilities: PlaybackCapabilities
-    ) -> None:
-        """Start a choice in the thread, which must be idle; RuntimeError if it cannot start."""
+    ) -> tuple[Selection, ...] | None:
+        """Start a choice; return silence instead while a choice that was given up still works.
+
+        No choice may be pending. Raises RuntimeError if the thread cannot start.
+        """
+        if self.is_given_up:
+            return question.given_up()
         loop = asyncio.get_running_loop()
         choose = partial(chooser.choose, question, capabilities)
         future = loop.run_in_executor(self._threads, choose)
@@ -223,6 +229,7 @@ class ChoiceThread:
         self.pending = question
         future.add_done_callback(self._note_done)
         loop.call_later(TIME_LIMIT, self._note_time_limit, future)
+        return None
 
     def take(self) -> tuple[Selection, ...] | None:
         """Return the selections for the pending question, once; None before they are chosen.

@@ -46,12 +46,14 @@ class Selector:
     """Keeps a selection for the contacts on a plate, and chooses again when it no longer serves.
 
     All lasting contents are chosen together, in a thread if there are several, and kept while they
-    serve (`controller.play.continuity`). Each short pulse is chosen alone and never changed.
+    serve: a finger can move by `MOVE_TOLERANCE` (`controller.play.continuity`). Each short pulse is
+    chosen alone and never changed.
 
-    Once all fingers rest, contents are cross-faded to a better answer, if there is one, step by
-    step until anything changes: fingers, the table with its clocks, or the limits of the
-    amplifiers. If a finger was held back before that change, all contents are chosen again. A
-    choice that takes too long is given up: the lasting contents of several fingers are silent until
+    Once all fingers have rested for `RESTS_AFTER` (`controller.play.crossfades`), contents are
+    cross-faded to a better answer, if there is one, step by step until anything changes: fingers,
+    the table with its clocks, or the limits of the amplifiers. If a finger was held back before
+    that change, all contents are chosen again. `ChoiceThread` gives up a choice after `TIME_LIMIT`
+    (`controller.play.selected_contents`): the lasting contents of several fingers are silent until
     it has ended.
 
     chooser: makes the next choice, while the thread finishes with the former chooser; arrived:
@@ -314,16 +316,14 @@ class Selector:
         self._choose(question, capabilities, now)
 
     def _choose(self, question: Question, capabilities: PlaybackCapabilities, now: float) -> None:
-        """Choose for a question at a time [s]: immediately, or in the thread if it takes long.
-
-        While the thread works on a choice that was given up, it can make no other choice.
-        """
-        if not question.takes_long:
-            self._take(question, self.chooser.choose(question, capabilities), now)
-        elif self._thread.is_given_up:
-            self._take(question, question.given_up(), now)
+        """Choose for a question at a time [s]: immediately, or in the thread if it takes long."""
+        selections: tuple[Selection, ...] | None
+        if question.takes_long:
+            selections = self._thread.start(self.chooser, question, capabilities)
         else:
-            self._thread.start(self.chooser, question, capabilities)
+            selections = self.chooser.choose(question, capabilities)
+        if selections is not None:
+            self._take(question, selections, now)
 
     def _take(
         self,

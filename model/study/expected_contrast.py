@@ -10,6 +10,7 @@ from model.arrays import FloatArray
 from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
 from model.finger import decibels
+from model.processes import Progress, unseen
 from model.rig.rig import Rig, Uncertainty
 from model.study.contact_sets import MIN_DISTANCE, random_contacts
 from model.study.exact_plates import draw_plates, felt_on
@@ -72,22 +73,30 @@ class ExpectedContrast:
 
 
 def expected_contrast(
-    before: Rig, after: Rig, *, seed: int, frequencies: FloatArray | None = None, sets: int = 12
+    before: Rig,
+    after: Rig,
+    *,
+    seed: int,
+    frequencies: FloatArray | None = None,
+    sets: int = 12,
+    progress: Progress = unseen,
 ) -> list[ExpectedContrast]:
     """Return expected contrasts for one, two and three quiet fingers; reproducible by seed.
 
     before, after: the rig as written and as identified, on plates within the uncertainty of the
     identified rig. frequencies (f,) [Hz]: frequencies of the tables, by default the usual ones.
-    sets: number of contact sets.
+    sets: number of contact sets. progress: called with the number of sets done and the total.
     """
     written = build_table(before, frequencies=frequencies, drive_mode="phased")
     identified = build_table(after, frequencies=frequencies, drive_mode="phased")
     shorter_side = min(identified.plate.length, identified.plate.width)
     expected = []
-    for quiet in (1, 2, 3):
+    quiet_counts = (1, 2, 3)
+    total = sets * len(quiet_counts)
+    for stage, quiet in enumerate(quiet_counts):
         rng = np.random.default_rng([seed, quiet])
         contrasts = []
-        for _ in range(sets):
+        for number in range(sets):
             contacts = random_contacts(
                 rng,
                 quiet + 1,
@@ -97,6 +106,7 @@ def expected_contrast(
             )
             placed = Placement(contacts[:1], contacts[1:])
             contrasts.append(_contrasts_for(written, identified, placed, rng))
+            progress(stage * sets + number + 1, total)
         medians = np.median(contrasts, axis=0).tolist()
         expected.append(ExpectedContrast(quiet, *medians))
     return expected

@@ -153,7 +153,8 @@ def _identify_measured(
     identification = _fitted(rig, measured.measurement)
     expected = []
     if identification.can_promise:
-        expected = expected_contrast(rig, identification.rig, seed=seed)
+        with progress_bar("contact sets") as progress:
+            expected = expected_contrast(rig, identification.rig, seed=seed, progress=progress)
     rows = [
         _measured_line(rig, measured),
         *measured.notes,

@@ -144,7 +144,16 @@ def test_uneven_plate_is_promised_less(rig: Rig, identification: Identification)
     def promised(**tolerances: float) -> float:
         linear = replace(uncertainty, harmonic=0.0, **tolerances)
         uneven_rig = replace(uneven.rig, uncertainty=linear)
-        contrasts = expected_contrast(rig, uneven_rig, seed=1, frequencies=FREQUENCIES, sets=4)
+        counts: list[tuple[int, int]] = []
+        contrasts = expected_contrast(
+            rig,
+            uneven_rig,
+            seed=1,
+            frequencies=FREQUENCIES,
+            sets=4,
+            progress=lambda done, total: counts.append((done, total)),
+        )
+        assert counts == [(done, 12) for done in range(1, 13)]
         return contrasts[0].promised
 
     assert uneven.is_explained

@@ -45,15 +45,15 @@ class ExpectedWatchdog:
         self, remaining: float, when: Interval, *, is_enabled: bool, cause: str
     ) -> None:
         """Compare the remaining time [s] in a status; disarmed: 0."""
-        shortest = longest = 0.0
+        low = high = 0.0
         if is_enabled:
             if self.time == math.inf:
                 return
             slack = ROUNDED + self._slack
-            shortest = self.time - (when.latest - self.fed.earliest) - slack
-            longest = self.time - (when.earliest - self.fed.latest) + slack
-        if not shortest <= remaining <= max(longest, 0.0):
-            expected = f"{shortest:.6g} to {longest:.6g}"
+            low = self.time - (when.latest - self.fed.earliest) - slack
+            high = self.time - (when.earliest - self.fed.latest) + slack
+        if not low <= remaining <= max(high, 0.0):
+            expected = f"{low:.6g} to {high:.6g}"
             quantity = f"watchdog_left after {cause}"
             self._report("watchdog", when.latest, quantity, expected=expected, actual=remaining)
 

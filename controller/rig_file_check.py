@@ -36,7 +36,13 @@ from model.rig.rig_warnings import (
 from model.rig.sections import LimitsSection
 from model.structure.statics import support_problem
 from model.structure.surface import center_of_surface
-from model.study.promise_cost import ToleranceCosts, clock_cost, cost_rows, uncertainty_costs
+from model.study.promise_cost import (
+    ToleranceCosts,
+    clock_cost,
+    cost_rows,
+    force_rows,
+    uncertainty_costs,
+)
 from model.transients.excursions import excursion_notes
 
 _LOST_DB = 0.1
@@ -84,7 +90,7 @@ def check_rig(document: Document) -> CheckedFile:
     warnings = _rig_warnings(rig, balance, costs, [*link_warnings, *clock_warnings])
     rows: list[str] = []
     if costs is not None:
-        rows = cost_rows(rig.uncertainty, costs)
+        rows = [*cost_rows(rig.uncertainty, costs), *force_rows(rig, costs)]
         data["promised_contrast_db"] = costs.promised_db
         data["tolerance_costs_db"] = dict(costs.costs_db)
     return CheckedFile(summary + clock_line, warnings, data | clock_data, rows)

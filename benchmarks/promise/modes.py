@@ -22,8 +22,10 @@ from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 
-BANDS = ((40.0, 40.0), (40.0, 60.0), (60.0, 60.0), (80.0, 80.0), (130.0, 130.0), (170.0, 170.0))
-BANDS += ((200.0, 200.0), (300.0, 300.0), (40.0, 100.0), (40.0, 320.0))
+NARROW_BANDS = [
+    (frequency, frequency) for frequency in (40.0, 60.0, 80.0, 130.0, 170.0, 200.0, 300.0)
+]
+BANDS = [*NARROW_BANDS, (40.0, 60.0), (40.0, 100.0), (40.0, 320.0)]
 LEVELS_DB_SL = (14.0, 24.0)
 SAME_DB = 0.05
 ALONE_BANDS = ((100.0, 300.0), (150.0, 250.0), (180.0, 220.0), (200.0, 200.0))

@@ -19,6 +19,7 @@ from model.ensemble.draws import ClockErrors
 from model.errors import InputError
 from model.finger import FINGERTIP_RADIUS
 from model.rig.rig import BOUNDS, Rig, Uncertainty
+from model.structure.fingertips import Fingertip
 from model.study.contact_sets import random_contacts
 from model.study.overview import promised_to_another
 from model.study.weak_cells import contrasts_of
@@ -170,6 +171,26 @@ def cost_rows(uncertainty: Uncertainty, costs: ToleranceCosts) -> list[str]:
     key, cost = next(iter(listed.items()))
     rows.append(f"{key} costs most, {cost:.1f} dB: measure it ({MEASUREMENTS[key]})")
     return rows
+
+
+_FORCE_COST = 0.5  # dB of the fingertip's tolerance from which harder touches break promises
+
+
+def force_rows(rig: Rig, costs: ToleranceCosts) -> list[str]:
+    """Return the keys to set for harder touches, as lines; none if loads of fingers matter little.
+
+    Rigs whose other tolerances are small, by identification, lose promises if touches press harder
+    than the default `fingertip` (docs/measured/promise.md).
+    """
+    is_default = rig.fingertip == Fingertip() and rig.uncertainty.fingertip <= Uncertainty.fingertip
+    if not is_default or costs.costs_db.get("fingertip", 0.0) < _FORCE_COST:
+        return []
+    return [
+        "promises are for touches of 0.3 to 0.5 N; for 0.3 to 2 N on a panel that reports neither "
+        "force nor size of contacts, set",
+        "    fingertip: {stiffness: 1.8 kN/m, damping: 3.6 N s/m, contact_mass: 0.36 g}",
+        "    uncertainty: {fingertip: 0.8}",
+    ]
 
 
 def _coarse_table(rig: Rig) -> LocalizationTable:

@@ -168,6 +168,7 @@ def test_phased_promises_at_least_as_much_as_switched(band_hz: tuple[float, floa
         for mode in MODES:
             answer = query(table, placed, 14.0, drive_mode=mode, band_hz=band_hz)
             assert answer.is_reached
+            assert answer.promised_worst_db is not None
             worst[mode] = answer.promised_worst_db
         gains.append(worst["phased"] - worst["switched"])
 

@@ -32,14 +32,18 @@ from model.cli import app
 from model.errors import InputError
 from model.finger import Grid
 from model.rig.rig import Channel, Rig, Uncertainty
+from model.rig.rig_file import parse_rig
+from model.structure.fingertips import Fingertip
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study.contact_sets import random_contacts
 from model.study.overview import find_overview, summarize
 from model.study.promise_cost import (
     PromiseCost,
+    ToleranceCosts,
     clock_cost,
     cost_rows,
     costs_of_tolerances,
+    force_rows,
     uncertainty_costs,
 )
 from model.study.table_export import export_csv, export_mat
@@ -104,11 +108,14 @@ def test_contrast_of_two_fingers_is_one_figure() -> None:
     contrasts = []
     for questions in pair_questions(table, Grid(8, 6)):
         for placed in questions:
-            contrasts.append(query(table, placed, 20.0).fingers[0].promised_contrast_db)
+            contrast = query(table, placed, 20.0).fingers[0].promised_contrast_db
+            assert contrast is not None
+            contrasts.append(contrast)
 
     overview = summarize(table, find_overview(table))
     costs = uncertainty_costs(rig)
 
+    assert costs is not None
     assert costs.promised_db == pytest.approx(np.median(contrasts), abs=0.1)
     assert overview["promised_contrast_1_quiet_median_db"] == costs.promised_db
 
@@ -117,6 +124,7 @@ def test_check_lists_costs_of_tolerances_and_what_to_measure() -> None:
     """Damping counts as a factor, of 1 if exact."""
     rig = replace(smooth_rig(), uncertainty=replace(Uncertainty.none(), damping=1.5, gain=0.1))
     costs = uncertainty_costs(rig)
+    assert costs is not None
 
     first, *rows, last = cost_rows(rig.uncertainty, costs)
 
@@ -126,6 +134,21 @@ def test_check_lists_costs_of_tolerances_and_what_to_measure() -> None:
     assert [row.split()[0] for row in rows] == list(costs.costs_db)
     assert last.startswith(f"{next(iter(costs.costs_db))} costs most, ")
     assert last.endswith("(era rig identify)")
+
+
+def test_check_says_what_to_set_for_harder_touches() -> None:
+    """The keys that it prints, if loads of fingers matter; a rig with these keys gets none."""
+    identified = replace(smooth_rig(), uncertainty=IDENTIFIED)
+    rows = force_rows(identified, ToleranceCosts(20.0, {"fingertip": 1.0}))
+    assert force_rows(identified, ToleranceCosts(20.0, {"fingertip": 0.2})) == []
+
+    _, tip, tolerance = [row.strip() for row in rows]
+
+    text = RIG % "" + tip + "\n"
+    rig = parse_rig("rig.yaml", text.replace("damping: 1.02}", "damping: 1.02, fingertip: 0.8}"))
+    assert tolerance == "uncertainty: {fingertip: 0.8}"
+    assert rig.fingertip == Fingertip(stiffness=1800.0, damping=3.6, contact_mass=0.00036)
+    assert force_rows(rig, ToleranceCosts(20.0, {"fingertip": 1.0})) == []
 
 
 RIG = """

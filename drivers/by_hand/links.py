@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
-from drivers.host.bounds import FREQUENCY_FLOOR
+from drivers.host.rounding import FREQUENCY_FLOOR
 from drivers.protocol.definition import (
     MAX_LOSS_DETECTION_TIME,
     QUANTITIES,

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from drivers.host.amplifier import Amplifier
-from drivers.host.bounds import FREQUENCY_FLOOR
+from drivers.host.rounding import FREQUENCY_FLOOR
 from drivers.opening import Lines
 from drivers.protocol.definition import QUANTITIES
 from registry import threads

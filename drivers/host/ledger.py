@@ -14,22 +14,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from drivers.errors import CommandRefused
-from drivers.host.bounds import (
-    COMMIT_DELAY,
-    TOLERANCE,
-    Bounds,
-    Budget,
-    PeakSums,
-    Rounding,
-    VibrationSpan,
-    refused,
-    wire_limits,
-)
+from drivers.host.bounds import Bounds, PeakSums
+from drivers.host.budget import COMMIT_DELAY, Budget, VibrationSpan
+from drivers.host.rounding import Rounding, refused, wire_limits
 from drivers.playing import AmplifierLayer, Playback
 from drivers.protocol.definition import QUANTITIES, has_feature
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
 from registry.limits import GuardLimits
+
+TOLERANCE = 1 + 1e-9
+"""Tolerance factor of a limit for rounding of sums."""
 
 _LEVEL = QUANTITIES["level"]
 _STEP = QUANTITIES["envelope_step"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from drivers.errors import CommandRefused, Overtaken, Preempted
-from drivers.host.bounds import COMMIT_DELAY
+from drivers.host.budget import COMMIT_DELAY
 from drivers.host.identification import AmplifierIdentification
 from drivers.host.ledger import Ledger
 from drivers.playing import AmplifierLayer

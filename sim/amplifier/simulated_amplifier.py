@@ -284,7 +284,7 @@ class SimulatedAmplifier:
         flags = {
             "high_voltage": is_on,
             "interlock_open": self._is_interlock_open,
-            "limited": self._is_limited or self._is_sum_limited(now),
+            "limited": self._is_shown_limited(now),
         }
         clock = self.clock.reading(now) if self._marked is None else self._marked
         watchdog_left = 0.0
@@ -308,8 +308,13 @@ class SimulatedAmplifier:
         supply = 1.0 if is_on else self._discharging_supply(now)
         return with_readings(status, temperature=self._heat.at(now), supply=supply)
 
-    def _is_sum_limited(self, now: float) -> bool:
-        """Whether the sum of layers exceeds full level on a channel at a time [s]."""
+    def _is_shown_limited(self, now: float) -> bool:
+        """Whether a status at a time [s] shows that the sum of layers exceeds full level.
+
+        It does if the sum exceeds full level on a channel then, or has since the last status.
+        """
+        if self._is_limited:
+            return True
         return any(self.playback.level(channel, now) > LIMITED for channel in self._channels)
 
     def _discharging_supply(self, now: float) -> float:
@@ -320,7 +325,7 @@ class SimulatedAmplifier:
     def _acknowledge_status(self, now: float) -> None:
         """Note that a status at a time [s] has shown the mark and the limited sum."""
         self._shown_mark = self._marked
-        self._has_shown_limited = self._is_limited or self._is_sum_limited(now)
+        self._has_shown_limited = self._is_shown_limited(now)
         self._marked = None
         self._is_limited = False
 

@@ -14,7 +14,7 @@ from benchmarks.setting import random_contacts
 from model.answer.answer import Answer
 from model.answer.fingers_on_plate import DriveTones, FingersOnPlate
 from model.answer.plan import answer, query
-from model.answer.promise import promise
+from model.answer.promise import drawn_percentile
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.ensemble.draws import PROMISED_DRAWS
 from model.finger import FINGERTIP_RADIUS, decibels
@@ -112,4 +112,4 @@ def _spread(table: LocalizationTable, alone: Answer) -> float:
     drive = DriveTones.of([[(tones.rows[0], np.array(tones.weights[0], dtype=np.complex64))]])
     means, _ = fingers.felt(PROMISED_DRAWS, drive)
     felt = means[0, 0]
-    return float(decibels(promise(felt, 50) / promise(felt)))
+    return float(decibels(drawn_percentile(felt, 50) / drawn_percentile(felt)))

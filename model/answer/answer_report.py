@@ -32,7 +32,7 @@ from model.answer.answer import (
 )
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer, prepare_answers
-from model.answer.promise import loudest_power, promise
+from model.answer.promise import drawn_percentile, loudest_power
 from model.answer.question import PROMISED_PERCENTILE
 from model.answer.stimulus import ANY_BAND, BY_NAME, MUST, Finger, Placement, Stimulus
 from model.arrays import Float32Array, FloatArray, Point, lattice, nullable
@@ -280,7 +280,7 @@ def exposures(table: LocalizationTable, result: Answer) -> list[float]:
     weighted = []
     for finger in range(len(result.asked)):
         mean_square = loudest_power(power, harmonics, rows, finger)
-        weighted.append(promise(np.sqrt(mean_square), 100 - PROMISED_PERCENTILE))
+        weighted.append(drawn_percentile(np.sqrt(mean_square), 100 - PROMISED_PERCENTILE))
     return weighted
 
 

@@ -32,8 +32,9 @@ For n ERAs it is divided by n: their changes have no common phase, unlike their 
 finger. The value is fitted to plates solved in time, so that 90 % of the promises on a path hold.
 """
 
-_TINY = 1e-20  # power
-_TINY_AMPLITUDE = 1e-30
+# Smaller powers and amplitudes count as these, so that nothing is divided by zero.
+_LEAST_POWER = 1e-20
+_LEAST_AMPLITUDE = 1e-30
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +79,12 @@ def promised(
     is_apart: bool = True,
     gains: FloatArray | None = None,
     ringing: Sequence[RingingUnderFingers | None] = (),
-    ways: Sequence[Sequence[int]] = (),
+    path_points: Sequence[Sequence[int]] = (),
 ) -> Tones:
     """Compute the sensation of the tones of contents.
 
     gains (m,): None for the gains that give the contents' levels; ringing: per content, None for
-    continuous or shaped ones; ways: see `with_tones`.
+    continuous or shaped ones; path_points: see `with_tones`.
     """
     table = fingers.table
     shares = fingers.tips.fine_weights
@@ -101,10 +102,10 @@ def promised(
         gains = content_gains[tones.owners]
     amplitude_gains = gains.astype(np.float32)
     powers = powers.scaled(amplitude_gains, amplitude_gains)
-    if ways:
-        contents = contents.of_first(len(ways))
-        shares = shares[: len(ways)]
-        powers = _along_ways(powers, contents, tones, ways)
+    if path_points:
+        contents = contents.of_first(len(path_points))
+        shares = shares[: len(path_points)]
+        powers = _along_paths(powers, contents, tones, path_points)
     comparisons = list[_Comparison]()
     for threshold_set in range(len(table.threshold_sets)):
         tone_sensitivities = table.sensitivities[threshold_set, tones.rows]
@@ -136,13 +137,13 @@ def with_tones(
     weights: Sequence[Sequence[complex]],
     owners: IntArray,
     gains: FloatArray | None,
-    ways: Sequence[Sequence[int]] = (),
+    path_points: Sequence[Sequence[int]] = (),
 ) -> Answer:
     """Return the answer with other tones, and the resulting promises.
 
-    gains: of the tones, None for the gains that give the contents' levels. ways: for each of the
-    first fingers, the numbers of the fingers that represent points on its path; the finger feels
-    the mean power over these points.
+    gains: of the tones, None for the gains that give the contents' levels. path_points: for each of
+    the first fingers, the numbers of the fingers that represent points on its path; the finger
+    feels the mean power over these points.
     """
     contents = answer.contents
     fingers = FingersOnPlate.of(table, contents.places, contents.loads)
@@ -155,27 +156,27 @@ def with_tones(
         is_apart=answer.tones.is_apart,
         gains=gains,
         ringing=ringing,
-        ways=ways,
+        path_points=path_points,
     )
     stroke_factor = tones.stroke_factor if gains is None else answer.stroke_factor
     return replace(answer, tones=replace(tones, stroke_factor=stroke_factor))
 
 
-def _along_ways(
-    powers: _Powers, contents: Contents, tones: DriveTones, ways: Sequence[Sequence[int]]
+def _along_paths(
+    powers: _Powers, contents: Contents, tones: DriveTones, path_points: Sequence[Sequence[int]]
 ) -> _Powers:
     """Return the mean power along the path of each finger, with side bands at other fingers."""
     mean_powers = list[Float32Array]()
     mean_harmonics = list[Float32Array]()
-    for way in ways:
-        mean_powers.append(powers.tones[:, [*way]].mean(axis=1))
-        mean_harmonics.append(powers.harmonics[:, [*way]].mean(axis=1))
+    for points in path_points:
+        mean_powers.append(powers.tones[:, [*points]].mean(axis=1))
+        mean_harmonics.append(powers.harmonics[:, [*points]].mean(axis=1))
     power = np.stack(mean_powers, axis=1)
     harmonics = np.stack(mean_harmonics, axis=1)
     era_count = tones.weights.shape[1]
     for tone, owner in enumerate(tones.owners.tolist()):
         targets = [*contents.streams[owner].targets]
-        others = np.setdiff1d(range(len(ways)), targets)
+        others = np.setdiff1d(range(len(path_points)), targets)
         own_power = power[tone, targets].mean(axis=(0, 1))
         power[tone, others] += SIDE_BANDS / era_count * own_power
     return _Powers(power, harmonics)
@@ -197,7 +198,7 @@ def _compared(
             felt = felt_amplitudes(powers.tones, shares, tones.rows, is_own, (finger,))
             own_tones[finger] = is_own
             felt_by_finger[finger] = felt
-            level[finger] = felt[0], promise(felt)
+            level[finger] = felt[0], drawn_percentile(felt)
     weakest = np.min([*felt_by_finger.values()], axis=0)
     for finger in contents.quiet:
         own_tones[finger] = np.zeros(len(tones.rows), dtype=bool)
@@ -209,16 +210,18 @@ def _compared(
         if not is_foreign.any():
             continue
         foreign_power = _loudest_of(powers, tones, is_foreign, finger)
-        foreign_amplitude = np.sqrt(np.maximum(foreign_power, _TINY))
+        foreign_amplitude = np.sqrt(np.maximum(foreign_power, _LEAST_POWER))
         ratio = np.asarray(felt / foreign_amplitude, dtype=np.float32)
         ratios.append(ratio)
-        foreign_level[finger] = promise(foreign_amplitude, 100 - PROMISED_PERCENTILE)
-        contrast[finger] = figures(ratio)
-    worst = figures(np.asarray(np.min(ratios, axis=0))) if ratios else (np.nan,) * 3
+        foreign_level[finger] = drawn_percentile(foreign_amplitude, 100 - PROMISED_PERCENTILE)
+        contrast[finger] = nominal_median_and_promised(ratio)
+    worst_contrast = (np.nan, np.nan, np.nan)
+    if ratios:
+        worst_contrast = nominal_median_and_promised(np.asarray(np.min(ratios, axis=0)))
     if len(contents.streams) == 1:
         # The contrast of a single content is that at the loudest quiet finger.
-        contrast[[*contents.streams[0].targets]] = worst
-    return _Comparison(level, contrast, foreign_level, worst[2])
+        contrast[[*contents.streams[0].targets]] = worst_contrast
+    return _Comparison(level, contrast, foreign_level, worst=worst_contrast[2])
 
 
 def _loudest_of(
@@ -280,8 +283,10 @@ def _power_over_envelope(
     steady_mean = _nominal_means(steady, shares, targets)
     energy_mean = _nominal_means(energy, shares, targets)
     target_gains = sensation.gains[targets]
-    factors = np.square(target_gains * steady_mean / np.maximum(energy_mean, _TINY))
-    power = np.asarray(on_drawn_plates(energy, sensation.heard, factors.min()), dtype=np.float32)
+    amplitude_ratios = target_gains * steady_mean / np.maximum(energy_mean, _LEAST_POWER)
+    factors = np.square(amplitude_ratios)
+    felt_power = on_drawn_plates(energy, sensation.heard, factors.min())
+    power = np.asarray(felt_power, dtype=np.float32)
     power[targets] = energy[targets] * factors[:, None, None]
     return power
 
@@ -307,29 +312,34 @@ def _gains_to_levels(
     fingers feel at most half its amplitude, or nothing.
     """
     levels = contents.levels.astype(float)
-    imperceptible = 10 ** (IMPERCEPTIBLE_DB_SL / 20)
     different_rows = np.arange(len(tones.owners))  # as if all frequencies were different
     gains = np.empty(len(contents.streams))
     for number, stream in enumerate(contents.streams):
         is_own = tones.owners == number
         felt = felt_amplitudes(powers.tones, shares, different_rows, is_own, stream.targets)
         if stream.duration is None:
-            gains[number] = levels[number] / max(promise(felt), _TINY_AMPLITUDE)
+            gains[number] = levels[number] / max(drawn_percentile(felt), _LEAST_AMPLITUDE)
             continue
-        gains[number] = levels[number] / max(felt[0], _TINY_AMPLITUDE)
+        nominal_amplitude = max(float(felt[0]), _LEAST_AMPLITUDE)
+        gains[number] = levels[number] / nominal_amplitude
         others = contents.others(number)
         if not others:
             continue
-        foreign_powers = [_loudest_of(powers, tones, is_own, finger) for finger in others]
-        foreign_amplitude = np.sqrt(np.maximum(np.max(foreign_powers, axis=0), _TINY))
-        contrast = promise(felt / foreign_amplitude)
-        half = levels[number] * 10 ** (-MIN_RAISED_CONTRAST_DB / 20)
-        allowed_foreign = max(half, imperceptible)
-        allowed_gain = allowed_foreign * contrast / max(float(felt[0]), _TINY_AMPLITUDE)
         lasting = felt_amplitudes(steady.tones, shares, different_rows, is_own, stream.targets)
-        lasting_gain = levels[number] / max(promise(lasting), _TINY_AMPLITUDE)
+        lasting_gain = levels[number] / max(drawn_percentile(lasting), _LEAST_AMPLITUDE)
+        foreign_powers = [_loudest_of(powers, tones, is_own, finger) for finger in others]
+        foreign_amplitude = np.sqrt(np.maximum(np.max(foreign_powers, axis=0), _LEAST_POWER))
+        contrast = drawn_percentile(felt / foreign_amplitude)
+        allowed_gain = _allowed_foreign(levels[number]) * contrast / nominal_amplitude
         gains[number] = min(gains[number], max(allowed_gain, lasting_gain))
     return gains
+
+
+def _allowed_foreign(level: float) -> float:
+    """Return the amplitude that other fingers may feel of a raised stimulus with a level."""
+    half = level * 10 ** (-MIN_RAISED_CONTRAST_DB / 20)
+    imperceptible = 10 ** (IMPERCEPTIBLE_DB_SL / 20)
+    return float(max(half, imperceptible))
 
 
 def _within_stroke(
@@ -383,7 +393,7 @@ def _max_min_factors(
         per_level = (strokes[is_rising] / levels[is_rising, None]).sum(axis=0)
         remaining = np.maximum(free_stroke - settled, 0)
         level_by_era = np.full(len(free_stroke), np.inf)  # where nothing rises
-        np.divide(remaining, per_level, out=level_by_era, where=per_level > _TINY_AMPLITUDE)
+        np.divide(remaining, per_level, out=level_by_era, where=per_level > _LEAST_AMPLITUDE)
         level = level_by_era.min()
         has_ended = is_rising & (levels <= level)
         if not has_ended.any():
@@ -434,13 +444,15 @@ def loudest_power(
     return np.asarray(total.max(axis=0) + harmonics[:, finger].sum(axis=0))
 
 
-def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
-    """Return a percentile over the drawn plates of values (1 + d,), the first value being
-    nominal."""
+def drawn_percentile(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
+    """Return a percentile over the drawn plates of values (1 + d,), by default the promised one.
+
+    The first value is nominal.
+    """
     return float(percentile(values[1:].astype(float), percent))
 
 
-def figures(ratio: Float32Array) -> tuple[float, float, float]:
-    """Return the nominal value, the median of the drawn plates and the promise of ratios (1 +
-    d,)."""
-    return float(ratio[0]), promise(ratio, 50), promise(ratio)
+def nominal_median_and_promised(ratio: Float32Array) -> tuple[float, float, float]:
+    """Return the nominal value of ratios (1 + d,), and over the drawn plates the median and the
+    promised percentile."""
+    return float(ratio[0]), drawn_percentile(ratio, 50), drawn_percentile(ratio)

@@ -61,8 +61,17 @@ FEW_ROWS = 8
 With more, no pattern promised more in 960 questions; comparing takes as long as answering.
 """
 
-_TINY = 1e-20  # power
-_TOO_LOUD = 1e12  # power of rejected candidates
+# Smaller values count as these, so that nothing is divided by zero.
+_LEAST_POWER = 1e-20
+_LEAST_LEVEL = 1e-20
+_LEAST_AMPLITUDE = 1e-30
+
+_NEVER_CHOSEN = 1e12
+"""Power at all fingers of candidates that are not solved in time: 120 dB above the threshold.
+
+It is finite, since contrasts of such candidates are still computed and compared.
+"""
+
 _BATCH = 64  # candidates evaluated together
 
 
@@ -76,10 +85,10 @@ def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
     if library is not None and is_for_kernel(contents):
         tones = ask_kernel(library, table, contents)
     else:
-        tones = choose_by_numpy(table, contents, by_kernel=has_kernel)
+        tones = choose_by_numpy(table, contents, fingers_by_kernel=has_kernel)
     if not _could_be_switched(contents, tones):
         return tones
-    switched = _choose_switched(table, contents, by_kernel=has_kernel)
+    switched = _choose_switched(table, contents, fingers_by_kernel=has_kernel)
     if switched is None or not _is_better(switched, tones, contents.streams[0]):
         return tones
     return switched
@@ -139,13 +148,14 @@ class _Judgment:
 
 
 def choose_by_numpy(
-    table: LocalizationTable, contents: Contents, *, by_kernel: bool = False
+    table: LocalizationTable, contents: Contents, *, fingers_by_kernel: bool = False
 ) -> Tones:
     """Choose tones for each content and compute their promises, in numpy.
 
-    by_kernel: whether to solve the plate with fingers in C.
+    fingers_by_kernel: whether to solve the plate under the fingers in C; the search itself never
+    uses the kernel.
     """
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=fingers_by_kernel)
     ringing = RingingUnderFingers.of_streams(table, contents)
     candidates = _SEARCHES[contents.drive_mode](fingers, contents, ringing)
     return _best_tones(fingers, contents, candidates, ringing)
@@ -179,10 +189,10 @@ def _could_be_switched(contents: Contents, tones: Tones) -> bool:
 
 
 def _choose_switched(
-    table: LocalizationTable, contents: Contents, *, by_kernel: bool
+    table: LocalizationTable, contents: Contents, *, fingers_by_kernel: bool
 ) -> Tones | None:
     """Choose the best switched pattern at one frequency, and promise it; None if there is none."""
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=fingers_by_kernel)
     ringing = RingingUnderFingers.of_streams(table, contents)
     rows, forms = _switched_forms(fingers, contents, ringing)
     candidates = list[_Candidate]()
@@ -340,6 +350,10 @@ def _candidates_at(
     """Find the best tones of each content in each band, and whether a level was hard to reach.
 
     With all ERAs together, or with each group of ERAs on a common clock.
+
+    K contents share the stroke of the ERAs. The level of each is raised by 20 log10(K) dB: drives
+    that reach K times its amplitude at full stroke need at most a K-th of every ERA's stroke at its
+    own amplitude, so that all contents fit together.
     """
     content_count = len(contents.streams)
     frequencies = fingers.table.frequencies
@@ -501,27 +515,59 @@ def _judged(
     least = np.empty(len(loudest))
     for number, stream in enumerate(contents.streams):
         indices = np.flatnonzero(candidates.contents == number)
-        own[indices] = means[indices][:, [*stream.targets]].min(axis=1)
+        content_drives = [candidates.drives[index] for index in indices.tolist()]
         content_ringing = ringing[number]
         others = contents.others(number)
+        content_own = means[indices][:, [*stream.targets]].min(axis=1).astype(float)
+        content_loudest = loudest[indices]
         if content_ringing is not None and others and not content_ringing.envelope.is_course:
-            by_energy = own[indices] / np.sqrt(loudest[indices][:, others].max(axis=1))
-            order = indices[best_first(percentile(by_energy))]
-            loudest[order[IN_TIME:]] = _TOO_LOUD
-            best = order[:IN_TIME]
-            best_drives = [candidates.drives[index] for index in best.tolist()]
-            own[best], loudest[best] = _judged_in_time(
-                fingers, content_ringing, stream, best_drives, own[best], loudest[best]
+            content_own, content_loudest = _best_in_time(
+                fingers,
+                content_ringing,
+                stream,
+                others,
+                content_drives,
+                content_own,
+                content_loudest,
             )
         if content_ringing is None:
-            least[indices] = percentile(own[indices, 1:])
+            content_least = percentile(content_own[:, 1:])
         else:
-            least[indices] = own[indices, 0]
+            content_least = content_own[:, 0]
+        least[indices] = content_least
         if len(contents.streams) > 1:
-            gain = contents.levels[number] / np.maximum(least[indices], _TINY)
-            own[indices] *= gain[:, None]
-            loudest[indices] *= gain[:, None, None] ** 2
+            gain = contents.levels[number] / np.maximum(content_least, _LEAST_LEVEL)
+            content_own = content_own * gain[:, None]
+            content_loudest = content_loudest * gain[:, None, None] ** 2
+        own[indices] = content_own
+        loudest[indices] = content_loudest
     return _Judgment(least, own[:, 1:], loudest[:, :, 1:])
+
+
+def _best_in_time(
+    fingers: FingersOnPlate,
+    ringing: RingingUnderFingers,
+    stream: Stream,
+    others: Sequence[int],
+    drives: Sequence[WeightedTones],
+    own: FloatArray,
+    loudest: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Solve the best drives by energy in time; return amplitude (j, 1 + d) at targets and power
+    (j, k, 1 + d) of all drives, with the rest too loud to be chosen.
+
+    own, loudest: the same from the drives' energy.
+    """
+    contrast = own / np.sqrt(loudest[:, others].max(axis=1))
+    order = best_first(percentile(contrast))
+    best = order[:IN_TIME]
+    best_drives = [drives[index] for index in best.tolist()]
+    judged_own = own.copy()
+    judged_loudest = np.full_like(loudest, _NEVER_CHOSEN)
+    judged_own[best], judged_loudest[best] = _judged_in_time(
+        fingers, ringing, stream, best_drives, own[best], loudest[best]
+    )
+    return judged_own, judged_loudest
 
 
 def _felt_in_batches(
@@ -575,7 +621,7 @@ def best_tone(contents: Contents, scores: FloatArray, judgment: _Judgment) -> in
         steadiness = judgment.least / percentile(judgment.own, 50)
         return best_of(reaches * scores * steadiness)
     foreign_power = judgment.loudest[:, [*contents.quiet]].max(axis=1)
-    contrast = judgment.own / np.maximum(np.sqrt(foreign_power), 1e-30)
+    contrast = judgment.own / np.maximum(np.sqrt(foreign_power), _LEAST_AMPLITUDE)
     return best_of(np.where(reaches, percentile(contrast), 0.0))
 
 
@@ -667,10 +713,12 @@ def worst_ratios(
         if combinations.shape[1] > 1:
             for number, candidate in enumerate(combinations.T):
                 for finger in streams[number].targets:
-                    foreign_power = np.maximum(total[:, finger] - power[candidate, finger], _TINY)
+                    foreign_power = np.maximum(
+                        total[:, finger] - power[candidate, finger], _LEAST_POWER
+                    )
                     worst = np.minimum(worst, levels[:, number] / foreign_power)
         for finger in quiet:
-            foreign_power = np.maximum(total[:, finger], _TINY)
+            foreign_power = np.maximum(total[:, finger], _LEAST_POWER)
             worst = np.minimum(worst, levels.min(axis=1) / foreign_power)
         worst_of_sets = np.minimum(worst_of_sets, percentile(worst))
     return worst_of_sets

@@ -23,6 +23,7 @@ PROMISED = (
 
 MIN_LEASE = 1.0  # s
 MAX_LEASE = 60.0  # s; without a client, nothing can stop the plate sooner
+MAX_RADIUS = 1.0  # m; of a contact
 MAX_RATE = 60.0  # Hz; of notifications: the refresh rate of a screen
 
 DaemonStateName: TypeAlias = Literal[
@@ -201,7 +202,7 @@ class TouchPoint(ApiMessage):
     """from the plate's south-west corner"""
     y_m: float
     """from the plate's south-west corner, upwards"""
-    radius_m: float | None = None
+    radius_m: Annotated[float, Field(ge=0, le=MAX_RADIUS)] | None = None
     """radius of the contact, if known; 12.5 mm or more is a resting hand"""
 
 

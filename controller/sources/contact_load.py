@@ -31,6 +31,9 @@ MAX_FINGER_MAJOR = 25.0
 HAND_MAJOR = 50.0
 """Longer axis [mm] of a hand with `HAND_LOAD`: a circle of 20 cm²."""
 
+MAX_HAND_MAJOR = 1e3
+"""Longer axis [mm] above which a reported contact counts as this long; no hand is as long."""
+
 LANDING = 0.1
 """Time [s] until the contact area of a landing finger is stable; earlier loads are ignored."""
 
@@ -59,7 +62,8 @@ class LightPress:
         """
         size = touch_major / (self.touch_major or math.inf)
         if size > MAX_FINGER_MAJOR / LIGHT_MAJOR:
-            relative_size = size * LIGHT_MAJOR / HAND_MAJOR
+            major = min(size * LIGHT_MAJOR, MAX_HAND_MAJOR)  # its power is finite
+            relative_size = major / HAND_MAJOR
             return HAND_LOAD * float(max(1.0, relative_size**_SIZE_EXPONENT))
         if self.pressure is not None and pressure > 0:
             load = (pressure / self.pressure) ** _FORCE_EXPONENT

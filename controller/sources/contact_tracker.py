@@ -101,9 +101,11 @@ class ContactTracker:
         keeps_taps: whether to keep a contact for a while if its lift arrives together with it.
         """
         rejected: list[str] = []
-        touches: dict[ContactKey, Touch] = {}
+        contacts: dict[ContactKey, Contact] = {}
         if math.isfinite(frame.time):
             touches = _valid_touches(frame, self._plate, rejected)
+            # Before the first lift, so that the tracker stays consistent after an exception.
+            contacts = self._contacts_at(touches, frame.time)
             if keeps_taps:
                 self._keep_taps(frame)
         else:
@@ -111,18 +113,17 @@ class ContactTracker:
                 rejected.append("no_time")
             # The contacts of its source are lifted at the time of the newest frame.
             frame = replace(frame, time=self._newest)
-        up = self._lift(self._lifted_by(frame.source, touches))
+        up = self._lift(self._lifted_by(frame.source, contacts))
         self._frames[frame.source] = frame
         former_contacts = dict(self._contacts)
-        for key, touch in touches.items():
-            former = former_contacts.get(key)
-            if former is None and len(self._contacts) >= MAX_CONTACTS:
+        for key, contact in contacts.items():
+            if key not in former_contacts and len(self._contacts) >= MAX_CONTACTS:
                 evicted = self._evicted_by(key.source)
                 if evicted is None:
                     rejected.append("too_many")
                     continue
                 up += self._lift([evicted])
-            self._contacts[key] = self._contact(key, touch, former, frame.time)
+            self._contacts[key] = contact
         return self._finish(former_contacts, up, frame.time, rejected)
 
     def expire(self, now: float) -> Change:
@@ -142,6 +143,17 @@ class ContactTracker:
         for key, at in answered.items():
             waiting = key if key in self._contacts else None  # lifted meanwhile
             self._changed[waiting] = min(at, self._changed.get(waiting, at))
+
+    def _contacts_at(
+        self, touches: Mapping[ContactKey, Touch], time: float
+    ) -> dict[ContactKey, Contact]:
+        """Return the contacts of touches at a time [s]."""
+        contacts = {}
+        for key, touch in touches.items():
+            # A contact that is kept as a tap is lifted already; its id is now another touch.
+            former = None if key in self._tap_ends else self._contacts.get(key)
+            contacts[key] = self._contact(key, touch, former, time)
+        return contacts
 
     def _contact(
         self, key: ContactKey, touch: Touch, former: Contact | None, time: float

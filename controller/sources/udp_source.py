@@ -8,6 +8,7 @@ datagram. In a flood the newest are kept; the kernel would keep the oldest.
 
 import asyncio
 import contextlib
+import logging
 import math
 import re
 import socket
@@ -51,6 +52,8 @@ class Datagram(NamedTuple):
 DropSuperseded: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
 """Returns the waiting datagrams, in order, that no later one supersedes."""
 
+_logger = logging.getLogger(__name__)
+
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY = 64  # bytes; room for a timestamp and its header
@@ -67,6 +70,8 @@ class Datagrams:
         max_size: int,
         drop_superseded: DropSuperseded,
     ) -> None:
+        self.failures = 0
+        """Number of datagrams whose callback raised an exception; the first one is logged."""
         self._socket = endpoint
         self._received = received
         self._drop_superseded = drop_superseded
@@ -110,12 +115,22 @@ class Datagrams:
         self._is_due = False
         end = time.perf_counter() + MAX_ITERATION_TIME
         while self._waiting and self._socket.fileno() >= 0:  # the callback may close it
-            self._received(*self._waiting.popleft())
+            self._deliver(self._waiting.popleft())
             if len(self._waiting) > BACKLOG_THRESHOLD and time.perf_counter() >= end:
                 break
         if self._waiting and self._socket.fileno() >= 0:
             self._is_due = True
             self._loop.call_soon(self._deliver_backlog)
+
+    def _deliver(self, datagram: Datagram) -> None:
+        """Deliver a datagram; an exception must not hold up the next one, which may be a lift."""
+        try:
+            self._received(*datagram)
+        except Exception:  # a bug
+            self.failures += 1
+            if self.failures == 1:
+                host, port = datagram.peer
+                _logger.exception("datagram from %s:%d: dropped because of a bug", host, port)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]], offset: float) -> float:
         """Return the arrival of a datagram, never before the previous one.

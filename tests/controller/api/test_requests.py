@@ -115,6 +115,11 @@ def test_invalid_request_is_refused_with_its_id_if_that_can_be_read(
         ("arm", '{"owner":"me","lease_s":0.99}', "lease_s"),
         ("arm", '{"owner":"me","lease_s":61}', "lease_s"),
         ("arm", '{"owner":"me","lease_s":"5"}', "lease_s"),
+        (
+            "touch",
+            '{"source":"a","touches":[{"id":1,"x_m":0,"y_m":0,"radius_m":1.1}]}',
+            "touches.0.radius_m",
+        ),
         ("arm", '{"owner":"me","lease_s":1e999}', "lease_s"),
         ("arm", '{"owner":"me","lease_s":true}', "lease_s"),
         ("arm", '{"owner":"","lease_s":5}', "owner"),

@@ -27,7 +27,7 @@ from controller.sources.touch import (
 from controller.sources.touch_calibration import turned
 from model.structure.material import Material
 from model.structure.plate import Plate
-from registry.limits import HAND_LOAD, MAX_CONTACTS
+from registry.limits import HAND_LOAD, MAX_CONTACTS, MAX_HAND_LOAD
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 FINGER = Touch(1, 0.5, 0.5)
@@ -348,6 +348,27 @@ def moving_contact(positions: np.ndarray) -> Contact:
         time = (number - len(positions)) * FRAME_INTERVAL
         track = track_with(track, time, x, y)
     return Contact(ContactKey("a", 1), x, y, since=0.0, track=track)
+
+
+def test_touch_of_any_finite_size_is_tracked(tracker: TouchedTracker) -> None:
+    """A touch 1e300 times as wide as the plate is a hand, and its frame lifts the other contact."""
+    tracker.touch(0.0, FINGER)
+    change = tracker.touch(0.01, Touch(2, 0.2, 0.2, size=(1e300, 0.1)))
+    assert keys(change.up) == [KEY]
+    assert [contact.load for contact in change.down] == [MAX_HAND_LOAD]
+
+
+def test_frame_that_cannot_be_tracked_changes_nothing(
+    tracker: TouchedTracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After an exception, the contact of the previous frame is lifted at that frame's timeout."""
+    tracker.touch(0.0, FINGER)
+    with monkeypatch.context() as patch:
+        patch.setattr("controller.sources.contact_tracker.track_with", None)
+        with pytest.raises(TypeError):
+            tracker.touch(0.01, Touch(2, 0.2, 0.2), keeps_taps=True)
+    assert keys(tracker.contacts) == [KEY]
+    assert keys(tracker.expire(CONTACT_TIMEOUT).up) == [KEY]
 
 
 def test_velocity_of_a_steady_way_is_exact() -> None:

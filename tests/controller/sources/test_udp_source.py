@@ -101,6 +101,26 @@ async def test_oversized_datagram_is_cut_to_one_byte_more() -> None:
     assert [len(data) for data, _ in received] == [100, 101]
 
 
+async def test_datagram_behind_a_failure_is_delivered(caplog: pytest.LogCaptureFixture) -> None:
+    """After two failures of the callback, of which one is logged, the third datagram arrives."""
+    received: asyncio.Queue[bytes] = asyncio.Queue()
+
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
+        if data == b"bad":
+            raise OverflowError
+        received.put_nowait(data)
+
+    line = await listen("127.0.0.1", 0, feed, max_size=100)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for data in (b"bad", b"bad", b"good"):
+            sender.sendto(data, ("127.0.0.1", line.port))
+        async with asyncio.timeout(TIME_LIMIT):
+            assert await received.get() == b"good"
+    line.close()
+    assert line.failures == 2
+    assert caplog.text.count("dropped because of a bug") == 1
+
+
 async def test_superseded_bundles_of_a_flood_are_dropped() -> None:
     """Of 200 frames that arrived while the loop was busy, a few and the newest are delivered."""
     received: list[bytes] = []

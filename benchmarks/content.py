@@ -45,7 +45,7 @@ from era_haptics.lab.checks.content_check import MAX_DELAY, check_content
 from kit.chain import Chain
 from kit.clock import run_virtual
 from model.answer.answer_report import Timing
-from model.config.fields import Circle
+from model.config.shapes import Circle
 from model.errors import InputError
 from model.finger import FINGERTIP_RADIUS
 from registry import threads

@@ -13,7 +13,8 @@ from controller.sources.touch import Contact, ContactKey
 from model.answer.envelope import Course
 from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION
 from model.arrays import FloatArray
-from model.config.fields import Quantity, RegionShape, Section
+from model.config.fields import Quantity, Section
+from model.config.shapes import RegionShape
 from model.config.units import FREQUENCY, LEVEL
 from model.finger import STRONG_DB_SL
 

@@ -30,7 +30,8 @@ from controller.play.intent import band_problem
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
 from model.config.document import Document, KeyPath, is_null_word, read_document
-from model.config.fields import Quantity, Section, ShapedSection, Validation
+from model.config.fields import Quantity, Section, Validation
+from model.config.shapes import ShapedSection
 from model.config.units import LEVEL
 from model.errors import InputError
 from model.finger import STRONG_DB_SL

@@ -38,7 +38,7 @@ from kit.host_rules import HostTimes
 from kit.plates import make_paper_rig, small_table
 from kit.wires import after_each, on_amplifiers
 from model.answer.answer_report import Timing
-from model.config.fields import Rectangle
+from model.config.shapes import Rectangle
 from model.finger import STRONG_DB_SL, Grid
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

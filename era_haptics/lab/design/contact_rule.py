@@ -14,16 +14,8 @@ from pydantic import ConfigDict, Field, Strict
 
 from model.arrays import FloatArray, IntArray, Point, best_of, least_gap
 from model.config.document import read_document
-from model.config.fields import (
-    PointSection,
-    Quantity,
-    Rectangle,
-    RegionShape,
-    Section,
-    ShapedSection,
-    Validation,
-    box_of,
-)
+from model.config.fields import Quantity, Section, Validation
+from model.config.shapes import PointSection, Rectangle, RegionShape, ShapedSection, box_of
 from model.config.units import LENGTH
 from model.errors import InputError
 from model.rig.key_types import Identifier

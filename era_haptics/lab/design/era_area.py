@@ -13,7 +13,8 @@ from pydantic import Field
 
 from model.arrays import FloatArray
 from model.config.document import read_document
-from model.config.fields import Polygon, PolygonSection, Section, Validation
+from model.config.fields import Section, Validation
+from model.config.shapes import Polygon, PolygonSection
 from model.errors import InputError
 from model.rig.key_types import Identifier
 from model.structure.plate import Plate

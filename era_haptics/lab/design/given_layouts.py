@@ -10,7 +10,8 @@ from pydantic import Field
 from era_haptics.lab.design.problem import MIN_SUPPORTING, DesignProblem
 from model.arrays import FloatArray, Point
 from model.config.document import read_document
-from model.config.fields import PointSection, Section, Validation
+from model.config.fields import Section, Validation
+from model.config.shapes import PointSection
 from model.errors import InputError
 from model.rig.era_layouts import named_layouts
 

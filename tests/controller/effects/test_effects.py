@@ -15,7 +15,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import HapticIntent
 from controller.sources.touch import Contact, ContactKey
-from model.config.fields import Circle, Polygon, Rectangle
+from model.config.shapes import Circle, Polygon, Rectangle
 
 LEFT = Rectangle(0.0, 0.0, 0.1, 0.2)
 RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)

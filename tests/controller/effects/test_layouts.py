@@ -13,7 +13,7 @@ from controller.effects.player import EffectPlayer
 from controller.sources.touch import Contact, ContactKey
 from key_tables import key_rows
 from model.config.document import ConfigError
-from model.config.fields import Circle, CircleSection, Polygon, Rectangle, RectangleSection
+from model.config.shapes import Circle, CircleSection, Polygon, Rectangle, RectangleSection
 from model.rig.rig_file import example_rig_path, load_rig
 
 ROOT = Path(__file__).parents[3]

@@ -13,7 +13,7 @@ from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command
 from kit.chain import FINGER, OTHER, Chain, FarEnd, Sent
-from model.config.fields import Circle
+from model.config.shapes import Circle
 from model.vibration import Tone
 from registry import threads
 

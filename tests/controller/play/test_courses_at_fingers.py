@@ -32,7 +32,7 @@ from model.answer.envelope import STRONGEST
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, FloatArray, Point
-from model.config.fields import Circle, Rectangle
+from model.config.shapes import Circle, Rectangle
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig, parse_rig
 from model.table.table import LocalizationTable

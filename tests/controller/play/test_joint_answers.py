@@ -38,7 +38,7 @@ from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
-from model.config.fields import Rectangle
+from model.config.shapes import Rectangle
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.contact_sets import random_contacts

@@ -38,7 +38,7 @@ from kit.fingers import playable
 from kit.fingers import table as paper_table
 from kit.plates import smooth_rig
 from model.arrays import Point
-from model.config.fields import Circle, Rectangle
+from model.config.shapes import Circle, Rectangle
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from tests.era_haptics.lab.checks.pressed_layout import WIRES, press

@@ -38,7 +38,7 @@ from controller.api.jsonrpc import (
 from controller.api.link import credentials_of
 from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import ApiMessage
-from controller.api.silencing import read_silencing
+from controller.api.silencing import find_silencing_line, read_silencing
 from controller.process.log import RateLimiter
 from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
@@ -52,7 +52,8 @@ UNREAD_TIMEOUT = 5.0  # s; of dropped notifications, before the connection is cl
 MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
 MAX_PENDING = 8  # slow requests per client; requests that silence are always accepted
 MAX_PENDING_STOPS = 64  # requests without responses; above it no further line is read
-STOP = b'"stop"'
+_STOP_MARKS = (b'"stop"', b"\\u006", b"\\u007")  # the last two: escaped letters
+_MAX_MARK_LENGTH = max(map(len, _STOP_MARKS))
 
 MAX_CONNECTIONS = 32  # for all methods
 RESERVE = 8  # additional connections, for the reserve methods only
@@ -132,8 +133,9 @@ class Connection(asyncio.BufferedProtocol):
         self.received_at = self._server.clock()
         old_length = len(self._input)
         self._input += self._received[:nbytes]
-        # The beginning of a stop may have been received before.
-        last_stop = self._input.rfind(STOP, max(0, old_length - len(STOP) + 1))
+        # The beginning of a mark may have been received before.
+        start = max(0, old_length - _MAX_MARK_LENGTH + 1)
+        last_stop = max(self._input.rfind(mark, start) for mark in _STOP_MARKS)
         self._stop_at = max(self._stop_at, last_stop)
         if self._line_end < 0:
             self._line_end = self._input.find(b"\n", old_length)
@@ -490,10 +492,10 @@ class ApiServer:
         task.add_done_callback(lambda task: self._finished(client, task))
 
     def _serve_last_stops(self, client: Connection) -> None:
-        """Carry out the waiting requests of a client that silence, and end its input."""
-        lines = client.take_lines()
-        if read_silencing(lines) is not None:
-            self._serve(client, lines)
+        """Carry out the waiting request of a client that silences most, and end its input."""
+        line = find_silencing_line(client.take_lines())
+        if line is not None:
+            self._serve(client, line)
 
     def _start(self, client: Connection, call: _Call) -> ApiMessage | Awaitable[ApiMessage]:
         """Call the handler of a method; an arm handler first waits for more input."""

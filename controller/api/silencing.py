@@ -6,7 +6,7 @@ other error; the error is reported afterwards.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -16,7 +16,10 @@ from controller.api.schema import ApiMessage
 
 _PRECEDENCE = ("stop", "disarm")  # if a line names both methods
 _MARKS = (b"stop", b"disarm", b"\\u")  # every line that silences contains one
+_MARK = re.compile(b"|".join(map(re.escape, _MARKS)))
+_MAX_CANDIDATES = 64  # lines that are parsed at once, so that the event loop never waits for long
 _NAMED = re.compile(rb'"method"\s*:\s*"(%s)"' % "|".join(_PRECEDENCE).encode())
+_ESCAPED_LETTER = re.compile(rb"\\u00([67][0-9a-fA-F])")
 
 
 class SilencingRequest(NamedTuple):
@@ -47,9 +50,45 @@ def read_silencing(line: bytes) -> SilencingRequest | None:
     return None
 
 
+def find_silencing_line(lines: bytes) -> bytes | None:
+    """Return the line that silences most; None if no line silences. Never fails.
+
+    This is the first stop, else the last disarm without a lease, else the last disarm. Behind many
+    lines that may silence, the remaining text counts as one line.
+    """
+    last_disarm: bytes | None = None
+    is_restricted = True  # whether the last disarm applies to one lease only
+    for line in _candidates(lines):
+        request = read_silencing(line)
+        if request is None:
+            continue
+        if request.method == "stop":
+            return line
+        has_lease = getattr(request.params, "lease", None) is not None
+        if is_restricted or not has_lease:
+            last_disarm = line
+            is_restricted = has_lease
+    return last_disarm
+
+
+def _candidates(lines: bytes) -> Iterator[bytes]:
+    """Yield the lines that may silence; after many, yield the remaining text as one line."""
+    position = 0
+    for _ in range(_MAX_CANDIDATES):
+        mark = _MARK.search(lines, position)
+        if mark is None:
+            return
+        start = lines.rfind(b"\n", 0, mark.start()) + 1
+        end = lines.find(b"\n", mark.end())
+        position = end if end >= 0 else len(lines)
+        yield lines[start:position]
+    yield lines[position:]
+
+
 def _search(text: bytes) -> SilencingRequest | None:
     """Search text for a method that silences; its parameters cannot be read."""
-    methods = _NAMED.findall(text)
+    unescaped = _ESCAPED_LETTER.sub(lambda match: bytes.fromhex(match[1].decode()), text)
+    methods = _NAMED.findall(unescaped)
     for method in _PRECEDENCE:
         if method.encode() in methods:
             return SilencingRequest(method, readable_params(method, {}))

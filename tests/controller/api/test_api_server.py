@@ -32,6 +32,7 @@ def line(method: str, id: int | None = None) -> bytes:
 
 ASKING = line("renew")
 TOUCHING = line("touch")
+ESCAPED_STOP = r"\u0073top"
 WRONG_STOP = request("stop", '{"x":1}')
 WRONG_DISARM = request("disarm", '{"level":2}')
 
@@ -308,6 +309,44 @@ async def test_stop_of_a_client_that_is_lost_is_carried_out() -> None:
 
 
 @in_virtual_time
+async def test_escaped_stop_of_a_client_that_is_lost_is_carried_out() -> None:
+    """A stop with an escaped letter wins over the disarm before it, whatever else waits."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    client.send(TOUCHING * 100, line("disarm"), request(ESCAPED_STOP, "{}"), line("arm"))
+    client.leave()
+    await api.settle()
+
+    assert api.names == ["stop"]
+
+
+@pytest.mark.parametrize(
+    ("disarms", "lease"),
+    [
+        (['{"lease":"old"}'], "old"),
+        (['{"lease":"old"}', '{"lease":"new"}'], "new"),
+        (["{}", '{"lease":"old"}'], None),
+        (['{"lease":"old"}'] * 64 + ["{}"], None),
+    ],
+)
+@in_virtual_time
+async def test_disarm_of_a_client_that_is_lost_keeps_its_lease(
+    disarms: list[str], lease: str | None
+) -> None:
+    """The last disarm is carried out for its lease, unless one without a lease waits."""
+    api = timed_api()
+    client = MemoryClient(api)
+
+    client.send(ASKING, *(request("disarm", params) for params in disarms))
+    client.leave()
+    await api.settle()
+
+    [(name, params, _)] = api.calls
+    assert (name, params.model_dump()["lease"]) == ("disarm", lease)
+
+
+@in_virtual_time
 async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
     """For 3 ms at most if touches follow each other without a gap; otherwise until it is sent."""
     api = timed_api()
@@ -325,8 +364,9 @@ async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
     assert api.names == ["renew"] * 4
 
 
+@pytest.mark.parametrize("method", ["stop", ESCAPED_STOP])
 @in_virtual_time
-async def test_stop_is_served_at_once_though_touches_come_first() -> None:
+async def test_stop_is_served_at_once_though_touches_come_first(method: str) -> None:
     """Also behind other requests of its client, and in two parts."""
     api = timed_api()
     client = MemoryClient(api)
@@ -335,7 +375,7 @@ async def test_stop_is_served_at_once_though_touches_come_first() -> None:
     await asyncio.sleep(0.001)
     assert api.names == []
 
-    client.send(b'{"jsonrpc":"2.0","method":"stop","para')
+    client.send(f'{{"jsonrpc":"2.0","method":"{method}","para'.encode())
     client.send(b'ms":{}}\n')
     await asyncio.sleep(0.0001)
 

@@ -112,7 +112,7 @@ class ApiService:
         return {name: getattr(self, name) for name in METHODS}
 
     def client_left(self, client: Connection) -> None:
-        """Release the lease and subscriptions of a disconnected client; lift its fingers."""
+        """Forget a disconnected client and lift its fingers; its lease runs until it expires."""
         self._publisher.hub.forget(client)
         if client in self._numbers:
             self._controller.cycle.lift(f"{self._origin(client)}:")

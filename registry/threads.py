@@ -1,10 +1,9 @@
-"""Threads, garbage collection, retries and time for programs that control amplifiers.
+"""Threads, garbage collection and time for programs that control amplifiers.
 
 - Blocking work runs in daemon threads, so that neither a cancellation nor an exit waits for it.
   asyncio's own thread pool would delay the end of a program, forever if a connection hangs.
 - Garbage collections are kept short while amplifiers are armed. A full collection takes 80 ms with
   the numerical and CAN libraries loaded, and on a busy machine longer than an amplifier's watchdog.
-- Pauses between retries increase.
 - `now` is the time of the event loop, which can be virtual.
 """
 
@@ -235,41 +234,6 @@ def without_collections() -> Iterator[None]:
                 gc.freeze()
             if is_outermost:
                 gc.enable()
-
-
-FIRST_PAUSE = 0.1
-"""First pause between retries [s]; a loose contact recovers in this time."""
-
-MAX_PAUSE = 5.0
-"""Maximum pause between retries [s]: the longest wait after an adapter was plugged in again."""
-
-GOOD_TIME = 60.0
-"""Time of successful operation [s] after which pauses are reset."""
-
-
-def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[float]:
-    """Yield pauses between attempts [s], each twice the previous pause, up to a maximum."""
-    pause = first
-    while True:
-        yield pause
-        pause = min(2 * pause, maximum)
-
-
-class Backoff:
-    """Pauses before restarts of a program: each twice the previous pause, reset after a good run.
-
-    first, maximum: the shortest and the longest pause [s].
-    """
-
-    def __init__(self, first: float, maximum: float) -> None:
-        self._bounds = first, maximum
-        self._pauses = pauses(*self._bounds)
-
-    def pause(self, *, ran_for: float) -> float:
-        """Return the pause [s] before the restart of a program that ran for a time [s]."""
-        if ran_for >= GOOD_TIME:
-            self._pauses = pauses(*self._bounds)
-        return next(self._pauses)
 
 
 async def stop_accepting(server: asyncio.Server) -> None:

@@ -77,7 +77,8 @@ from controller.api.methods import (
 from controller.api.schema import ApiMessage, Empty, Topic
 from controller.api.silencing import readable_params
 from model.errors import InputError
-from registry.threads import LoopRunner, LoopThread, pauses
+from registry.retries import pauses
+from registry.threads import LoopRunner, LoopThread
 
 MAX_QUEUED_EVENTS = 1000  # waiting to be read; the oldest is dropped
 _TOUCH_INTERVAL = 0.05  # s; a finger counts as lifted 150 ms after its last report

@@ -25,7 +25,7 @@ from controller.process.child import child_command, ended
 from model.arrays import FloatArray
 from model.errors import InputError
 from registry import threads
-from registry.threads import Backoff
+from registry.retries import Backoff
 
 _MAX_PAUSE = 30.0  # s
 _TERMINATE_TIMEOUT = 0.3  # s

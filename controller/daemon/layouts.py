@@ -24,7 +24,8 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from registry import threads
 from registry.plugins import did_you_mean, failure_text
-from registry.threads import Backoff, in_thread
+from registry.retries import Backoff
+from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from drivers.errors import DriverError, LinkError, WrongAmplifier
 from drivers.host.stops import StopOutcome
 from model.errors import InputError
 from registry import threads
-from registry.threads import pauses
+from registry.retries import pauses
 
 _RECHECK = 0.05  # s; between checks of the watchdog of a lost amplifier
 _REOPENING = "the daemon reconnects on its own and stays disarmed"

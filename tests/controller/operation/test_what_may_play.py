@@ -16,6 +16,7 @@ import pytest
 from cases import shortly
 from controller.daemon.amplifier_messages import amplifier_statuses
 from controller.operation.operation_states import DaemonEvent, DaemonState
+from drivers.by_hand.rows import silence_rows
 from drivers.errors import DriverError
 from kit.chain import FINGER
 from kit.clock import in_virtual_time, run_virtual
@@ -127,7 +128,7 @@ def rows_of_status(plate: SupervisedPlate) -> Rows:
         clock_errors=controller.group.clock_errors,
     )
     now = threads.now()
-    rows = {name: what_may_play(name).rows(now) for name in controller.urls}
+    rows = {name: silence_rows(what_may_play(name), now) for name in controller.urls}
     for status in statuses:
         replies = status.state is not None and not status.degraded
         expected = None if replies else rows[status.name]
@@ -175,7 +176,7 @@ async def check_stop(plate: SupervisedPlate) -> None:
     """
     outcomes = await plate.supervisor.stop("a test")
     now = threads.now()
-    stopped = {name: outcome.rows(now) for name, outcome in outcomes.items()}
+    stopped = {name: silence_rows(outcome, now) for name, outcome in outcomes.items()}
     status = rows_of_status(plate)
     for name, row in stopped.items():
         if row["silence"] == SILENT:
@@ -253,7 +254,7 @@ async def test_stop_says_what_is_known(case: str) -> None:
 
         now = threads.now()
         assert now - stopped_from < (0.65 if "lost" in case else 0.33)
-        row = outcomes["main"].rows(now)
+        row = silence_rows(outcomes["main"], now)
         assert [row[key] for key in SILENCE_KEYS] == [silence, may_play_for]
         status = rows_of_status(plate)["main"]
         assert silence in (SILENT, status["silence"])

@@ -26,6 +26,7 @@ _LEVEL = QUANTITIES["level"]
 _PHASE = QUANTITIES["phase"]
 _FREQUENCY = QUANTITIES["frequency"]
 _SLEW = QUANTITIES["slew"]
+_STEP = QUANTITIES["envelope_step"]
 LAYERS_MAX = QUANTITIES["layer_count"].maximum
 """Largest number of layers of an amplifier."""
 
@@ -245,8 +246,15 @@ class Playback:
         self._note_changes()
 
     def scale(self, time: float, factor: float, ramp: float) -> None:
-        """Scale all lasting tones and their endings by a factor, along a ramp [s]."""
+        """Scale all lasting tones and their endings by a factor, along a ramp [s].
+
+        Sets that wait until an onset has ended start at the scaled levels.
+        """
         self.advance(time)
+        for layer in self._layers.values():
+            if layer.waiting is not None:
+                scaled_set = layer.waiting.layer_set.scaled(factor)
+                layer.waiting = replace(layer.waiting, layer_set=scaled_set)
         for channel, voices in enumerate(self.all_voices):
             scaled = []
             for voice in voices:
@@ -321,10 +329,16 @@ class Playback:
                 ends.append(voice.silent_from)
         for number, layer in self._layers.items():
             if layer.waiting is not None:
-                return math.inf
+                ends.append(self._waiting_ends_by(layer.waiting))
             if layer.ends < math.inf or self._lasts(number):
                 ends += self._fade_ends(number, layer) or [layer.ends]
         return max(ends, default=-math.inf)
+
+    def _waiting_ends_by(self, waiting: _Layer) -> float:
+        """Return when a set that waits has faded at the latest [s], if no other set follows."""
+        layer_set = waiting.layer_set
+        end = _end_of(layer_set, waiting.starts_at) + self.uncertainty
+        return end + fade_of(layer_set)
 
     def _lasts(self, number: int) -> bool:
         """Whether a layer has a tone that lasts; tones at level 0 do not."""
@@ -411,6 +425,16 @@ def playback_of(capabilities: Values) -> Playback:
 def _silent(layer: int) -> _Layer:
     """Return the state of a layer in which nothing plays."""
     return _Layer(LayerSet(layer, ramp=0, valid_for=0))
+
+
+def fade_of(layer_set: LayerSet) -> float:
+    """Return how long a layer takes to end [s], along its ramp or its longest ending."""
+    fade = layer_set.ramp / _PER_RAMP
+    for command in layer_set.commands:
+        if command.ending is not None:
+            steps = len(command.ending.knots) + 1
+            fade = max(fade, _STEP.from_wire(command.ending.step) * steps)
+    return fade
 
 
 def _end_of(layer_set: LayerSet, time: float) -> float:

@@ -49,6 +49,7 @@ from registry import threads
 _TOKEN_SPAN = 1 << 16
 _MAX_GAP = 1 << 14  # tokens; with the tokens between two checks, below half of the span
 _TOKENS_BETWEEN_CHECKS = 1 << 12
+_LINE_RECHECK = 0.5e-3  # s, between two looks at a line whose request nobody awaits
 _WORD_STEP = AHEAD_MAX // 2  # between two high words that are tried
 
 
@@ -288,7 +289,8 @@ class JointSets:
                 requests[amplifier] = amplifier.ping()
         # The broadcasts are awaited too: a queued one is not sent if this is cancelled.
         statuses = await self._members.all([*requests.values(), *broadcasts])
-        for amplifier, status in zip(requests, statuses, strict=False):
+        replies = statuses[: len(requests)]  # without the broadcasts
+        for amplifier, status in zip(requests, replies, strict=True):
             if status["token"] != token or status["state"] in LATCHED:
                 await _check_plays(amplifier, status, staged_sets[amplifier])
 
@@ -353,12 +355,19 @@ def _shown(amplifier: Amplifier, time: float) -> float:
 
 
 async def _wait_until_free(lines: Sequence[Line], *, until: float) -> None:
-    """Wait until a commit can be sent on all lines simultaneously, or until a time [s]."""
+    """Wait until a commit can be sent on all lines simultaneously, or a time [s] has passed.
+
+    A request that ends after that time is awaited too: its line is busy anyway.
+    """
     while threads.now() < until:
         busy = [line.current.result for line in lines if line.current is not None]
         if not busy:
             return
-        await asyncio.wait(busy)
+        unfinished = [reply for reply in busy if not reply.done()]
+        if unfinished:
+            await asyncio.wait(unfinished)
+        else:  # their callers were cancelled, but the requests are still on the lines
+            await asyncio.sleep(_LINE_RECHECK)
 
 
 def _refusals(

@@ -17,7 +17,7 @@ from drivers.errors import CommandRefused
 from drivers.host.bounds import Bounds, PeakSums
 from drivers.host.budget import COMMIT_DELAY, Budget, VibrationSpan
 from drivers.host.rounding import Rounding, refused, wire_limits
-from drivers.playing import AmplifierLayer, Playback
+from drivers.playing import AmplifierLayer, Playback, fade_of
 from drivers.protocol.definition import QUANTITIES, has_feature
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
@@ -27,7 +27,6 @@ TOLERANCE = 1 + 1e-9
 """Tolerance factor of a limit for rounding of sums."""
 
 _LEVEL = QUANTITIES["level"]
-_STEP = QUANTITIES["envelope_step"]
 _RAMP = QUANTITIES["ramp"]
 _VALID_FOR = QUANTITIES["valid_for"]
 _STEPS = 2  # tolerance of levels in a status, in steps
@@ -124,7 +123,7 @@ class Ledger:
         self, layers: tuple[LayerSet, ...], now: float, delay: float
     ) -> tuple[LayerSet, ...]:
         """Return layers with `valid_for` cut to the time that on-time and duty leave."""
-        fade = 0.0 if self._budget.is_unlimited else max(map(_fade, layers))
+        fade = 0.0 if self._budget.is_unlimited else max(map(fade_of, layers))
         delay_with_onsets = delay + self._waits(layers, now)
         remaining = self._budget.remaining(now, fade=fade, delay=delay_with_onsets)
         if remaining == math.inf:
@@ -154,8 +153,10 @@ class Ledger:
         that time on the amplifier's clock [s]. If a commit is repeated, the set may have played
         since the first one, even if a status contradicts this: the status may be older.
         """
-        if self.doubt is not None and self.doubt.token == token:
-            return
+        if self.doubt is not None:
+            if self.doubt.token == token:
+                return
+            self._count_as_played(self.doubt)
         if self._last_token != token:
             self._last_token = token
             self._last_sent_at = now if starts is None else starts
@@ -166,6 +167,15 @@ class Ledger:
             lasts = 0.0 if self._budget.is_unlimited else max(map(_duration, layers))
             last_vibration = self._budget.sent(now, lasts=lasts + self._waits(layers, now))
         self.doubt = Doubt(token, layers, self._last_sent_at, last_vibration)
+
+    def _count_as_played(self, doubt: Doubt) -> None:
+        """Count a set in doubt as played, so that only one set is in doubt: silence follows it.
+
+        The limits of levels, duty and on-time hold if it plays. Its layers may as well be silent.
+        """
+        self.resolve(doubt.token, doubt.sent_at)
+        for layer_set in doubt.layers:
+            self.may_be_silent.add(layer_set.layer)
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt at a time [s] by the token that the amplifier has committed last.
@@ -414,21 +424,11 @@ class Ledger:
         return max(ends, default=now) - now
 
 
-def _fade(layer: LayerSet) -> float:
-    """Return how long a layer takes to end [s], along its ramp or its longest ending."""
-    fade = _RAMP.from_wire(layer.ramp)
-    for command in layer.commands:
-        if command.ending is not None:
-            steps = len(command.ending.knots) + 1
-            fade = max(fade, _STEP.from_wire(command.ending.step) * steps)
-    return fade
-
-
 def _duration(layer: LayerSet) -> float:
     """Return how long a layer vibrates at most [s], with its fade."""
     if not is_vibrating(layer):
-        return _fade(layer)
-    return _fade(layer) + (_VALID_FOR.from_wire(layer.valid_for) or math.inf)
+        return fade_of(layer)
+    return fade_of(layer) + (_VALID_FOR.from_wire(layer.valid_for) or math.inf)
 
 
 def is_silence(layers: Sequence[AmplifierLayer]) -> bool:

@@ -7,7 +7,7 @@ part contains the values of a Set message, and the far end collects parts in an 
 import math
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 from drivers.protocol.definition import (
@@ -118,6 +118,12 @@ class Command:
                 peak = max(peak, envelope.peak)
         return peak
 
+    def scaled(self, factor: float) -> "Command":
+        """Return it with its level, and the levels of all knots, times a factor."""
+        onset = self.onset and self.onset.scaled(factor)
+        ending = self.ending and self.ending.scaled(factor)
+        return replace(self, level=round(self.level * factor), onset=onset, ending=ending)
+
 
 @dataclass(frozen=True, slots=True)
 class LayerSet:
@@ -132,6 +138,11 @@ class LayerSet:
     commands: tuple[Command, ...] = ()
     after: bool = False
     renew: bool = False
+
+    def scaled(self, factor: float) -> "LayerSet":
+        """Return it with all levels, also of knots, times a factor."""
+        commands = [command.scaled(factor) for command in self.commands]
+        return replace(self, commands=tuple(commands))
 
 
 def is_vibrating(*layers: LayerSet) -> bool:

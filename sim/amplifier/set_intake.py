@@ -1,11 +1,10 @@
 """Intake of sets in a simulated amplifier: collected in parts, staged, and committed."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Assembly, Command, LayerSet, is_newer_token, unpack_layers
+from drivers.protocol.sets import Assembly, LayerSet, is_newer_token, unpack_layers
 
 Layers: TypeAlias = tuple[LayerSet, ...]
 
@@ -118,18 +117,3 @@ class SetIntake:
             room = self.capabilities["set_words"]
             raise Refusal(f"a set must have at most {room} words", "BAD_LENGTH")
         return unpack_layers(stream, self.capabilities)
-
-
-def derated(layers: Layers, factor: float) -> Layers:
-    """Return the layers with all levels, also of knots, times a factor."""
-    derated_layers = []
-    for layer in layers:
-        commands = tuple([_derated_command(command, factor) for command in layer.commands])
-        derated_layers.append(replace(layer, commands=commands))
-    return tuple(derated_layers)
-
-
-def _derated_command(command: Command, factor: float) -> Command:
-    onset = command.onset and command.onset.scaled(factor)
-    ending = command.ending and command.ending.scaled(factor)
-    return replace(command, level=round(command.level * factor), onset=onset, ending=ending)

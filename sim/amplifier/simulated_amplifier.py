@@ -48,7 +48,7 @@ from sim.amplifier.readings import (
     measured,
     with_readings,
 )
-from sim.amplifier.set_intake import Layers, SetIntake, derated
+from sim.amplifier.set_intake import Layers, SetIntake
 from sim.amplifier.thermal_state import (
     DERATE_ABOVE,
     DERATED,
@@ -553,7 +553,9 @@ class SimulatedAmplifier:
 
     def _play(self, layers: Layers, token: int, now: float) -> None:
         """Start the layers of a set at a time [s]."""
-        allowed_layers = derated(layers, DERATED) if self.is_derated else layers
+        allowed_layers = layers
+        if self.is_derated:
+            allowed_layers = tuple([layer.scaled(DERATED) for layer in layers])
         self.playback.commit(allowed_layers, token, now)
         if all(layer.renew for layer in layers):
             return

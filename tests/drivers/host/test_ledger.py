@@ -286,6 +286,18 @@ def test_on_time_includes_the_onset_that_a_set_waits_for() -> None:
     assert waiting.valid_for == pytest.approx(800, abs=2)
 
 
+def test_on_time_ends_with_a_set_that_has_waited_for_an_onset() -> None:
+    """After 0.2 s from the onset's end at 0.03 s, and a pause of ten seconds, 1 s is free again."""
+    account = Account(on_time=1.0, duty=0.5)
+    onset = Envelope(100, ((2000, 0),) * 2)
+    account.play(0.0, layer(0, tone(onset=onset), valid_for=0.2))
+    account.play(0.01, layer(0, tone(keep_phase=True), valid_for=0.2, after=True))
+
+    admitted = account.admit(20.0, layer(1, tone(channel=1), valid_for=0.5))
+
+    assert admitted.valid_for == 500
+
+
 def test_duty_cycle_counts_vibration_within_ten_seconds() -> None:
     """Of 2 s, two of 0.5 s and three ramps of 20 ms leave 0.94 s, less 0.1 s for each delay."""
     account = Account(duty=0.2)
@@ -393,6 +405,18 @@ def test_failing_check_refuses_and_leaves_silence_possible() -> None:
     assert account.ledger.doubt is None
     assert account.ledger.playback.tokens == {0: 1}
     account.admit(1.0, layer(0))
+
+
+def test_set_in_doubt_counts_as_played_when_silence_of_another_layer_follows() -> None:
+    """0.9 may still play on layer 0 after layer 1 is silent, so 0.2 more would exceed 1."""
+    account = Account()
+    account.send(0.0, layer(0, tone(0.9)), layer(1, tone(0.1, channel=1)))
+    account.send(0.1, layer(1))
+
+    account.ledger.resolve(account.token, 0.102)
+
+    account.refuse(0.5, layer(2, tone(0.2, frequency=150.0)))
+    account.admit(0.5, layer(2, tone(0.05, frequency=150.0)))
 
 
 def test_set_in_doubt_admits_only_silence_until_it_is_resolved() -> None:

@@ -18,6 +18,7 @@ from drivers.errors import (
     Overtaken,
     Preempted,
 )
+from drivers.host import joint_sets
 from drivers.host.joint_sets import PlayedSet
 from drivers.host.set_admission import StagedSet
 from drivers.protocol.definition import MESSAGES
@@ -675,3 +676,25 @@ async def test_amplifier_left_out_for_65536_sets_plays_on_and_takes_the_next(
     await rig.play(0.2)
     await rig.group.silence(0.0)
     assert rig.levels == {"a": SILENT, "b": SILENT}
+
+
+async def test_waiting_for_a_line_with_an_unawaited_request_leaves_the_processor_free() -> None:
+    """In 30 ms it looks at most every 0.5 ms, although the caller of the request was cancelled."""
+
+    class BusyLine:
+        """A line with a request whose caller was cancelled."""
+
+        looks = 0
+
+        @property
+        def current(self) -> Any:
+            self.looks += 1
+            reply = asyncio.get_running_loop().create_future()
+            reply.cancel()
+            return Mock(result=reply)
+
+    line: Any = BusyLine()
+
+    await joint_sets._wait_until_free([line], until=threads.now() + 0.03)
+
+    assert 2 <= line.looks <= 2 * 60

@@ -24,7 +24,7 @@ import pytest
 from drivers.errors import LinkError
 from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
 from kit.wires import make_bench, until
@@ -103,8 +103,11 @@ class Requests:
     ) -> Values:
         """Send a set of one layer with channels and levels [1e-4] of tones of 100 Hz."""
         commands = tuple(Command(channel, 2000, level, 0) for channel, level in tones)
-        words = pack_layers((LayerSet(layer, 0, 0, commands),))
-        (part,) = parts(words, session=SESSION, token=token, now=now)
+        return self.send(time, token, LayerSet(layer, 0, 0, commands), now=now)
+
+    def send(self, time: float, token: int, layer_set: LayerSet, *, now: bool = True) -> Values:
+        """Send a set of one layer in one part; return the status that replies."""
+        (part,) = parts(pack_layers((layer_set,)), session=SESSION, token=token, now=now)
         return self.amplifier.handle("Set", part, time)
 
 
@@ -127,6 +130,21 @@ def test_heat_derates_and_then_trips() -> None:
     assert state_name(requests.ask(0.22, "Clear", latch=1)) == "FAULT"
     requests.amplifier.set_temperature(60.0, 0.3)
     assert state_name(requests.ask(0.31, "Clear", latch=1)) == "SWITCH_ON_DISABLED"
+
+
+def test_set_that_waits_for_an_onset_is_derated_too() -> None:
+    """It was sent at 0.2 s, the heat came at 0.25 s, and the onset ends at 0.4 s: half of 8000."""
+    requests = Requests(is_armed=False)
+    requests.arm(0.0, watchdog=2000)
+    onset = Envelope(1000, ((2000, 0),) * 2)  # three steps of 0.1 s
+    beginning = LayerSet(0, 20, 0, (Command(0, 2000, 2000, 0, onset=onset),))
+    following = LayerSet(0, 20, 0, (Command(0, 2000, 8000, 0),), after=True)
+    requests.send(0.1, 1, beginning)
+    requests.send(0.2, 2, following)
+
+    requests.amplifier.set_temperature(75.0, 0.25)
+
+    assert requests.status(0.9)["levels"] == [4000, 0]
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,8 @@ class Ledger:
         """Largest error of that time on the amplifier's clock [s]."""
         self._advanced_to = -math.inf
         """Everything due by this time [s] has been carried out."""
+        self._is_playback_unsure = False
+        """Whether silence followed a vibration in doubt, which may play or not."""
         self.may_be_silent = set[int]()
         """Layers that may be silent, after a silence without a reply or a renewal that was late."""
         self.doubt: Doubt | None = None
@@ -108,6 +110,8 @@ class Ledger:
             if self.doubt is not None:
                 token = self.doubt.token
                 raise CommandRefused(f"set {token} must be confirmed first; read the status")
+            if self._is_playback_unsure:
+                raise CommandRefused("a set had no reply before the next; silence the amplifier")
             requested = self._within_budget(requested, now, delay)
             self._check_sums(requested, now, delay)
             return requested
@@ -156,7 +160,7 @@ class Ledger:
         if self.doubt is not None:
             if self.doubt.token == token:
                 return
-            self._count_as_played(self.doubt)
+            self._leave_in_doubt(self.doubt)
         if self._last_token != token:
             self._last_token = token
             self._last_sent_at = now if starts is None else starts
@@ -168,12 +172,17 @@ class Ledger:
             last_vibration = self._budget.sent(now, lasts=lasts + self._waits(layers, now))
         self.doubt = Doubt(token, layers, self._last_sent_at, last_vibration)
 
-    def _count_as_played(self, doubt: Doubt) -> None:
-        """Count a set in doubt as played, so that only one set is in doubt: silence follows it.
+    def _leave_in_doubt(self, doubt: Doubt) -> None:
+        """Note that silence follows a set in doubt before its reply.
 
-        The limits of levels, duty and on-time hold if it plays. Its layers may as well be silent.
+        A vibration counts as played, but may as well be lost, so that what it should replace plays
+        on. Levels have no bound then, and no vibration is admitted until all layers end. A silence
+        counts as lost; its layers may be silent.
         """
-        self.resolve(doubt.token, doubt.sent_at)
+        if is_vibrating(*doubt.layers):
+            self.resolve(doubt.token, doubt.sent_at)
+            self._is_playback_unsure = True
+            return
         for layer_set in doubt.layers:
             self.may_be_silent.add(layer_set.layer)
 
@@ -233,6 +242,7 @@ class Ledger:
         if doubt is not None and doubt.sent_at - self._start_error < sent_at:
             self.resolve(doubt.token, doubt.sent_at)
         self.doubt = None
+        self._is_playback_unsure = False
         self.may_be_silent = set()
         self.lag = max(self.lag, now - sent_at)
         self.playback.uncertainty = self.lag

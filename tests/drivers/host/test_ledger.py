@@ -407,13 +407,31 @@ def test_failing_check_refuses_and_leaves_silence_possible() -> None:
     account.admit(1.0, layer(0))
 
 
-def test_set_in_doubt_counts_as_played_when_silence_of_another_layer_follows() -> None:
-    """0.9 may still play on layer 0 after layer 1 is silent, so 0.2 more would exceed 1."""
+@pytest.mark.parametrize("levels", [(0.1, 0.9), (0.9, 0.1)], ids=["arrived", "lost"])
+def test_no_vibration_is_admitted_after_silence_followed_a_set_in_doubt(
+    levels: tuple[float, float],
+) -> None:
+    """Layer 0 may play 0.9 whether its second set arrived or not, until all layers end."""
     account = Account()
-    account.send(0.0, layer(0, tone(0.9)), layer(1, tone(0.1, channel=1)))
-    account.send(0.1, layer(1))
+    first_level, second_level = levels
+    account.play(0.0, layer(0, tone(first_level)), layer(1, tone(0.1, channel=1)))
+    account.send(0.1, layer(0, tone(second_level)))
+    account.send(0.2, layer(1))
+    account.ledger.resolve(account.token, 0.202)
 
-    account.ledger.resolve(account.token, 0.102)
+    account.refuse(0.5, layer(2, tone(0.2, frequency=150.0)))
+    account.ledger.note_ended(ramp=0.02, sent_at=0.6, now=0.6)
+
+    account.admit(1.0, layer(2, tone(0.2, frequency=150.0)))
+
+
+def test_silence_that_was_lost_before_another_leaves_no_room() -> None:
+    """0.9 may play on layer 0 after two silences without replies; 0.2 more would exceed 1."""
+    account = Account()
+    account.play(0.0, layer(0, tone(0.9)), layer(1, tone(0.1, channel=1)))
+    account.send(0.1, layer(0))
+    account.send(0.2, layer(1))
+    account.ledger.resolve(account.token, 0.202)
 
     account.refuse(0.5, layer(2, tone(0.2, frequency=150.0)))
     account.admit(0.5, layer(2, tone(0.05, frequency=150.0)))

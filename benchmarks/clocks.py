@@ -37,9 +37,9 @@ from kit.wires import far_side, on_amplifiers
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from registry import threads
+from sim.far_ends.firmware import find_firmware, running_firmware
 from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
-from sim.simulation import find_firmware, running_firmware
 
 NAMES = ("west", "middle", "east")
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
@@ -155,6 +155,7 @@ class _Readings:
 
 async def firmware_skew(seconds: float) -> tuple[float, float]:
     """Return the RMS error of a clock in the last half of a time, and its uncertainty [s]."""
+    firmware = find_firmware(is_emulated=False)
     readings: list[_Readings] = []
 
     def watch(amplifiers: Mapping[str, Amplifier]) -> None:
@@ -162,7 +163,7 @@ async def firmware_skew(seconds: float) -> tuple[float, float]:
 
     async with AsyncExitStack() as stack:
         urls = {
-            name: await stack.enter_async_context(running_firmware(find_firmware(), name))
+            name: await stack.enter_async_context(running_firmware(firmware, name))
             for name in NAMES
         }
         controller = make_controller(make_rig(NAMES), urls)

@@ -49,6 +49,13 @@ def sim(
             "does not move.",
         ),
     ] = False,
+    cortex_m: Annotated[
+        bool,
+        typer.Option(
+            "--cortex-m",
+            help="Like --firmware, on a Cortex-M3 emulated by QEMU for each amplifier.",
+        ),
+    ] = False,
     wire: Annotated[
         list[str] | None,
         typer.Option(
@@ -115,8 +122,9 @@ def sim(
 
     with exit_on_signal():
         from model.rig.rig_file import load_rig
+        from sim.far_ends.firmware import find_firmware
         from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
-        from sim.simulation import Simulation, find_firmware
+        from sim.simulation import Simulation
         from sim.transport.simulated_line import PROMPT
         from sim.transport.terminal_links import links_by_amplifier
 
@@ -140,7 +148,8 @@ def sim(
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
         loaded_rig = load_rig(rig)
-        if firmware:
+        is_firmware = firmware or cortex_m
+        if is_firmware:
             flags = {
                 "--wire": wire,
                 "--shared": shared,
@@ -150,8 +159,7 @@ def sim(
                 "--virtual-time": virtual_time,
             }
             _check_firmware_options(ports, flags)
-        program = find_firmware() if firmware else None
-        urls_to_wire = {} if firmware else loaded_rig.amplifiers
+        urls_to_wire = {} if is_firmware else loaded_rig.amplifiers
         wires = assign_wires(
             urls_to_wire, common=common_wire, options=wire or [], defaults=defaults
         )
@@ -165,7 +173,7 @@ def sim(
             imperfections=_imperfections(loaded_rig, plate_seed),
             control=control,
             until_eof=until_eof,
-            firmware=program,
+            firmware=find_firmware(is_emulated=cortex_m) if is_firmware else None,
             links={**links_of(wires), **links},
         )
         _run(simulation, virtual_time=virtual_time)

@@ -2,10 +2,6 @@
 
 Uses the time of the event loop: the wall clock, or a virtual clock stepped explicitly while I/O is
 served as usual.
-
-The project's firmware can replace the simulated amplifiers, with a process and a serial line for
-each. `make firmware` builds it from the sources of a checkout; it is not part of the wheel. Its
-samples drive nothing, so the plate does not move.
 """
 
 import asyncio
@@ -14,71 +10,24 @@ import os
 import selectors
 import signal
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from drivers.errors import LinkError
 from model.arrays import Point
-from model.errors import InputError
 from model.rig.rig import Rig
 from registry import threads
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket, in_background
+from sim.far_ends.firmware import Firmware, running_firmware
 from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
 from sim.plant.imperfections import Imperfections
 from sim.transport.terminal_links import linked_urls
 
-FIRMWARE_FOLDER = Path(__file__).parents[1] / "out" / "firmware"
-"""Where `make firmware` puts its programs."""
-
-_STARTUP_TIMEOUT = 10.0  # s
 STEP = 0.005  # s of virtual time; the largest delay of a timer
-
-
-def find_firmware() -> Path:
-    """Return the program of the built firmware; InputError if it does not exist."""
-    program = FIRMWARE_FOLDER / "era-firmware"
-    if program.exists():
-        return program
-    if (FIRMWARE_FOLDER.parents[1] / "firmware").is_dir():
-        raise InputError(f"firmware: {program} does not exist; run `make firmware` first")
-    raise InputError(
-        "firmware: its C sources are not part of this installation; run from a checkout of "
-        "era-haptics, after `make firmware`"
-    )
-
-
-@contextlib.asynccontextmanager
-async def running_firmware(program: Path, name: str) -> AsyncIterator[str]:
-    """Run the firmware for an amplifier, yield its URL. Raises LinkError.
-
-    It ends with this process, even if this process is killed, because its standard input ends.
-    """
-    process = await asyncio.create_subprocess_exec(
-        program,
-        "--serial",
-        "--until-eof",
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.DEVNULL,
-    )
-    assert process.stdout is not None  # noqa: S101  a pipe was requested
-    try:
-        async with asyncio.timeout(_STARTUP_TIMEOUT):
-            url = (await process.stdout.readline()).decode().strip()
-        if not url.startswith("serial://"):
-            raise LinkError(f"firmware of {name}: no line was opened, got {url!r}")
-        yield url
-    except TimeoutError:
-        raise LinkError(f"firmware of {name}: not ready in {_STARTUP_TIMEOUT:g} s") from None
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.terminate()
-        await process.wait()
 
 
 class SteppedLoop(asyncio.SelectorEventLoop):
@@ -108,7 +57,7 @@ class Simulation:
 
     faults: with times from when the URLs are printed; fingers: initial positions [m];
     imperfections: differences between bench and rig; control: path of the control socket;
-    until_eof: end with standard input; firmware: program to run instead of simulated amplifiers;
+    until_eof: end with standard input; firmware: to run instead of simulated amplifiers;
     links: to the pseudo-terminals.
     """
 
@@ -119,7 +68,7 @@ class Simulation:
     imperfections: Imperfections = field(default_factory=Imperfections)
     control: Path | None = None
     until_eof: bool = False
-    firmware: Path | None = None
+    firmware: Firmware | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
 
 

@@ -40,9 +40,9 @@ def demo(
         str | None,
         typer.Option(
             help="Wire to the amplifiers: sim (no wire, in this process), or in real time serial "
-            "(pseudo-terminal), modbus (TCP), can (socketcand) or firmware (the C amplifier "
-            "on serial, after `make firmware`; the plate then does not move). Default: sim, or "
-            "serial in real time.",
+            "(pseudo-terminal), modbus (TCP), can (socketcand), firmware (the C amplifier on "
+            "serial, after `make firmware`) or cortex-m (the same on an emulated Cortex-M3, in "
+            "QEMU). With firmware the plate does not move. Default: sim, or serial in real time.",
             show_default=False,
         ),
     ] = None,

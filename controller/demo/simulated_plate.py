@@ -43,6 +43,7 @@ SIM_OPTIONS: Mapping[str, Sequence[str]] = {
     "modbus": ("--modbus-tcp", "0"),
     "can": ("--socketcand", "0"),
     "firmware": ("--firmware",),
+    "cortex-m": ("--cortex-m",),
 }
 """Options of `era sim` by wire; amplifiers share a bus, so that they start together."""
 

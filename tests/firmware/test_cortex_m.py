@@ -9,6 +9,8 @@ import json
 import subprocess
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -22,6 +24,7 @@ from drivers.protocol.records import Values
 from emulated_board import ERA, PROGRAMS, Board, emulated_board
 from processes.installed import installed_program
 from registry.limits import GuardLimits
+from sim.far_ends import firmware as sim_firmware
 
 pytestmark = pytest.mark.real_time
 
@@ -37,11 +40,17 @@ WATCHDOG = 2.0  # s
 
 
 @pytest.fixture(scope="module")
-def board(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Board]:
-    """A running board; skip the tests without its programs."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for the firmware; skip the tests without the programs that build and run it."""
     for program in PROGRAMS:
         installed_program(program, package=PACKAGES[program])
-    with emulated_board(tmp_path_factory.mktemp("mps2")) as running:
+    return tmp_path_factory.mktemp("mps2")
+
+
+@pytest.fixture(scope="module")
+def board(folder: Path) -> Iterator[Board]:
+    """A running board."""
+    with emulated_board(folder) as running:
         yield running
 
 
@@ -107,6 +116,21 @@ async def test_silent_host_trips_the_watchdog(board: Board) -> None:
         assert status["high_voltage"] == 0
         await amplifier.clear()
         await status_in(amplifier, "SWITCH_ON_DISABLED")
+
+
+async def test_simulation_runs_a_board_for_each_amplifier_until_it_ends(
+    board: Board, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An amplifier of `era sim --cortex-m` arms, plays and stops; its port is closed afterwards."""
+    monkeypatch.setattr(sim_firmware, "FIRMWARE_FOLDER", folder)
+    firmware = sim_firmware.find_firmware(is_emulated=True)
+    async with sim_firmware.running_firmware(firmware, "a") as url, opened(url) as amplifier:
+        await play(amplifier, 9)
+        await amplifier.stop(0.0)
+        await status_in(amplifier, "QUICK_STOP_ACTIVE")
+    port = urlsplit(url).port
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection("127.0.0.1", port)
 
 
 def test_short_conformance_passes(board: Board) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from model.errors import InputError
-from sim import simulation
+from sim.far_ends import firmware
 from sim.transport.simulated_line import LINE_KINDS
 from sim.transport.terminal_links import linked_urls, links_by_amplifier
 
@@ -67,13 +67,22 @@ def test_options_that_name_no_line_are_refused(options: list[str]) -> None:
         links_by_amplifier(options, amplifiers=["a", "b"])
 
 
+@pytest.mark.parametrize("is_emulated", [False, True])
 def test_missing_firmware_is_told_with_the_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    is_emulated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a checkout the command that builds it, elsewhere that a checkout is needed."""
-    monkeypatch.setattr(simulation, "FIRMWARE_FOLDER", tmp_path / "out" / "firmware")
+    monkeypatch.setattr(firmware, "FIRMWARE_FOLDER", tmp_path / "out" / "firmware")
+    monkeypatch.setattr(firmware, "EMULATOR", "sh")
     with pytest.raises(InputError, match="checkout"):
-        simulation.find_firmware()
+        firmware.find_firmware(is_emulated=is_emulated)
     (tmp_path / "firmware").mkdir()
     with pytest.raises(InputError, match="make firmware"):
-        simulation.find_firmware()
+        firmware.find_firmware(is_emulated=is_emulated)
+
+
+def test_missing_emulator_is_told_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without QEMU, the command that installs it."""
+    monkeypatch.setattr(firmware, "EMULATOR", "emulator-of-nobody")
+    with pytest.raises(InputError, match="apt install emulator-of-nobody"):
+        firmware.find_firmware(is_emulated=True)

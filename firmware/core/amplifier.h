@@ -70,6 +70,7 @@ struct amplifier {
     uint16_t latch;
     uint16_t session;  // held while armed, or the one that ended last; 0: none
     uint64_t sample;   // samples since power-up
+    uint64_t changed;  // first sample of the state, or of what a request plays or silences
     uint64_t clock;    // of the next sample, 20 s a turn of 2^64
     uint64_t step;     // of the clock per sample, by the host's rate
     uint32_t mark;     // the clock that the next status shows instead, if it

@@ -10,14 +10,27 @@ static bool plays_in(const struct voice *voice, uint8_t layer)
     return voice->is_playing && voice->layer == layer && !voice->has_ended;
 }
 
+// The silent voice that was sent on its way first, or null: later ones may still be in the converter's
+// buffer.
+static struct voice *silent_voice(struct channel *channel)
+{
+    struct voice *first = NULL;
+    for (unsigned i = 0; i < VOICES_KEPT; i++) {
+        struct voice *voice = &channel->voices[i];
+        if (!voice->is_playing && (first == NULL || voice->since < first->since))
+            first = voice;
+    }
+    return first;
+}
+
 // A place for another voice: one that is silent, else that of the fade that ends first. There are
 // as many more places than voices as one set can cut short.
 static struct voice *place(struct channel *channel, uint64_t sample)
 {
-    struct voice *first = &channel->voices[0];
-    for (unsigned i = 0; i < VOICES_KEPT; i++)
-        if (!channel->voices[i].is_playing)
-            return &channel->voices[i];
+    struct voice *first = silent_voice(channel);
+    if (first != NULL)
+        return first;
+    first = &channel->voices[0];
     for (unsigned i = 0; i < VOICES_KEPT; i++) {
         struct voice *voice = &channel->voices[i];
         if (voice->level == 0 && (first->level > 0 || voice_samples_left(voice, sample) <
@@ -150,34 +163,37 @@ static uint32_t magnitude(struct complex number)
 // Magnitude of the sum of the voices of one frequency, from a voice on, in units of 2^-30 of full
 // level; they count once. A voice alone needs no angle.
 static uint64_t sum_of_frequency(const struct channel *channel, unsigned first, bool is_counted[],
-                                 uint32_t clock, uint32_t before)
+                                 uint64_t sample, uint32_t clock, uint32_t before)
 {
     const struct voice *voice = &channel->voices[first];
+    struct complex amplitude = voice_amplitude(voice, sample, before);
     int64_t re = 0, im = 0;
     for (unsigned i = first + 1; i < VOICES_KEPT; i++) {
         const struct voice *other = &channel->voices[i];
-        if (!other->is_playing || other->frequency != voice->frequency)
+        if (other->frequency != voice->frequency || !voice_sounded(other, sample, before))
             continue;
-        struct complex pointer = voice_pointer(other, clock, before);
+        struct complex pointer =
+            voice_pointer(other, clock, voice_amplitude(other, sample, before));
         re += pointer.re;
         im += pointer.im;
         is_counted[i] = true;
     }
     if (re == 0 && im == 0)
-        return magnitude(voice_amplitude(voice, before));
-    struct complex pointer = voice_pointer(voice, clock, before);
+        return magnitude(amplitude);
+    struct complex pointer = voice_pointer(voice, clock, amplitude);
     struct complex sum = {.re = (int32_t)((re + pointer.re) >> SUM_SHIFT),
                           .im = (int32_t)((im + pointer.im) >> SUM_SHIFT)};
     return (uint64_t)magnitude(sum) << SUM_SHIFT;
 }
 
-uint16_t channel_level(const struct channel *channel, uint32_t clock, uint32_t before)
+uint16_t channel_level(const struct channel *channel, uint64_t sample, uint32_t clock,
+                       uint32_t before)
 {
     uint64_t size = 0;
     bool is_counted[VOICES_KEPT] = {false};
     for (unsigned i = 0; i < VOICES_KEPT; i++)
-        if (channel->voices[i].is_playing && !is_counted[i])
-            size += sum_of_frequency(channel, i, is_counted, clock, before);
+        if (!is_counted[i] && voice_sounded(&channel->voices[i], sample, before))
+            size += sum_of_frequency(channel, i, is_counted, sample, clock, before);
     uint64_t level = (size * LEVEL_PER_UNIT + ONE / 2) / ONE;
     return level > LEVEL_PER_UNIT ? LEVEL_PER_UNIT : (uint16_t)level;
 }

@@ -31,8 +31,9 @@ uint16_t channel_layers(const struct channel *channel);
 
 bool channel_is_silent(const struct channel *channel);
 
-// Level some samples before: the largest amplitude of the sum.
-uint16_t channel_level(const struct channel *channel, uint32_t clock, uint32_t before);
+// Level some samples before a sample: the largest amplitude of the sum.
+uint16_t channel_level(const struct channel *channel, uint64_t sample, uint32_t clock,
+                       uint32_t before);
 
 // Sum of the voices at this sample in units of 2^-30 of full level; then move on by one sample.
 int64_t channel_sum(struct channel *channel, uint32_t clock);

@@ -86,6 +86,8 @@ static void begin_later(struct amplifier *amplifier, uint8_t number)
 static void start_set(struct amplifier *amplifier, bool is_request)
 {
     struct waiting_set *set = &amplifier->waiting;
+    if (is_request)
+        amplifier->changed = amplifier->sample;
     struct reader reader = reader_of(set->words, set->count);
     while (reader.left > 0 && reader.nak == NAK_NONE) {
         const uint16_t *words = reader.at;
@@ -168,6 +170,7 @@ void layers_time(struct amplifier *amplifier)
 
 void layers_silence(struct amplifier *amplifier, uint16_t ramp)
 {
+    amplifier->changed = amplifier->sample;
     amplifier->waiting.token = 0;
     for (unsigned i = 0; i < LAYERS; i++)
         let_last(&amplifier->layers[i]);

@@ -17,6 +17,7 @@ static void enter(struct amplifier *amplifier, enum state state, uint8_t channel
     if (state == amplifier->state)
         return;
     amplifier->state = state;
+    amplifier->changed = amplifier->sample;
     if (state == OPERATION_ENABLED)
         amplifier->high_voltage = true;
     if (amplifier->notify != NULL) {

@@ -88,6 +88,7 @@ static void send(struct voice *voice, const struct envelope *shape, uint16_t ram
         voice->path = *shape;
     voice->along = 0;
     voice->stride = stride_of(shape != NULL ? shape->step : 10u * ramp);
+    voice->last_stride = 0;
     voice->still_at = (uint32_t)sample + samples_of(voice->path.knots + 1u, voice->stride);
     voice->to = target(voice, 0);
     voice->next = 1;
@@ -102,7 +103,7 @@ void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_
     voice->has_ended = false;
     voice->frequency = frequency;
     voice->to = silence;
-    voice->stride = 0;
+    voice->stride = voice->last_stride = 0;
     voice->number = number;
 }
 
@@ -141,6 +142,7 @@ static void move_on(struct voice *voice)
     if (voice->along >= before)
         return;
     if (voice->next > voice->path.knots) { // the end of the last line
+        voice->last_stride = voice->stride;
         voice->stride = 0;
         stop_if_silent(voice);
         return;
@@ -159,17 +161,26 @@ int32_t voice_sample(struct voice *voice, uint32_t clock)
     return value;
 }
 
-struct complex voice_amplitude(const struct voice *voice, uint32_t before)
+struct complex voice_amplitude(const struct voice *voice, uint64_t sample, uint32_t before)
 {
-    uint64_t way = (uint64_t)voice->stride * before;
-    if (voice->stride == 0)
-        return voice->to;
-    return way <= voice->along ? amplitude_at(voice, voice->along - (uint32_t)way) : voice->from;
+    uint32_t stride = voice->stride, samples = before;
+    uint64_t along = voice->along;
+    if (stride == 0) {
+        uint32_t still = (uint32_t)sample - voice->still_at; // samples for which it has stood
+        if (still >= before)
+            return voice->to;
+        if (voice->last_stride == 0)
+            return voice->from;
+        stride = voice->last_stride;
+        samples = before - still;
+        along = WHOLE;
+    }
+    uint64_t way = (uint64_t)stride * samples;
+    return way <= along ? amplitude_at(voice, (uint32_t)(along - way)) : voice->from;
 }
 
-struct complex voice_pointer(const struct voice *voice, uint32_t clock, uint32_t before)
+struct complex voice_pointer(const struct voice *voice, uint32_t clock, struct complex amplitude)
 {
-    struct complex amplitude = voice_amplitude(voice, before);
     uint32_t angle = voice->frequency * clock;
     int32_t re = cosine(angle), im = sine(angle);
     struct complex turned = {.re = times(amplitude.re, re) - times(amplitude.im, im),

@@ -25,12 +25,13 @@ struct voice {
     int16_t phase;
     struct complex from, to;  // ends of the present line
     uint32_t along, stride;   // position on it, a whole turn being its end; stride 0: it stands at `to`
+    uint32_t last_stride;     // that of the way it came, while it stands; 0: it jumped
     uint8_t next;             // knot behind this line; path.knots: the final amplitude
     struct envelope path;     // its way; without knots a raised cosine
     bool has_ending;
     struct envelope ending;   // how it falls silent by itself
     uint64_t since;           // sample at which it was sent on its way
-    uint32_t still_at;        // sample (low bits) at which it stands still, while its stride is not 0
+    uint32_t still_at;        // sample (low bits) at which its way ends or ended
     uint32_t number;          // of voices, in the order of their beginnings
 };
 
@@ -52,6 +53,13 @@ static inline uint32_t voice_samples_left(const struct voice *voice, uint64_t sa
     return voice->stride > 0 ? voice->still_at - (uint32_t)sample : 0;
 }
 
+// Whether it plays, or played some samples before a sample.
+static inline bool voice_sounded(const struct voice *voice, uint64_t sample, uint32_t before)
+{
+    uint32_t way = voice->still_at - (uint32_t)voice->since; // samples
+    return voice->is_playing || voice->since + way + before > sample;
+}
+
 // Whether it is not silent within a time [ms] by itself.
 static inline bool voice_outlasts(const struct voice *voice, uint16_t milliseconds, uint64_t sample)
 {
@@ -62,10 +70,10 @@ static inline bool voice_outlasts(const struct voice *voice, uint16_t millisecon
 // Value at this sample, at a time of the clock, in units of 2^-30 of full level; then move on by one.
 int32_t voice_sample(struct voice *voice, uint32_t clock);
 
-// Its amplitude some samples before, or at the beginning of its present line if that is later.
-struct complex voice_amplitude(const struct voice *voice, uint32_t before);
+// Its amplitude some samples before a sample, or at the beginning of its last line if that is later.
+struct complex voice_amplitude(const struct voice *voice, uint64_t sample, uint32_t before);
 
-// This amplitude, turned by the angle of its oscillator: those of one frequency add up.
-struct complex voice_pointer(const struct voice *voice, uint32_t clock, uint32_t before);
+// Turn an amplitude by the angle of the oscillator: those of one frequency add up.
+struct complex voice_pointer(const struct voice *voice, uint32_t clock, struct complex amplitude);
 
 #endif

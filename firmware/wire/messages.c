@@ -79,10 +79,13 @@ static void reply_status(struct words *reply, struct amplifier *amplifier)
                 (amplifier->measured.is_interlock_open ? FLAG_INTERLOCK_OPEN : 0) |
                 (amplifier->is_limited ? FLAG_LIMITED : 0);
     const uint32_t clock = (uint32_t)(amplifier->clock >> 32);
+    // Status shows what comes out now, but at once what a request has changed, and a silent state.
     const uint32_t buffered = (uint32_t)(amplifier->ahead > 0 ? amplifier->ahead - 1 : 0) >> 16;
+    const uint64_t unchanged = amplifier->sample - amplifier->changed;
+    const uint32_t before = unchanged < buffered ? (uint32_t)unchanged : buffered;
     const uint16_t playing = amplifier_layers(amplifier);
     for (unsigned i = 0; i < CHANNELS; i++)
-        levels[i] = channel_level(&amplifier->channels[i], clock, buffered);
+        levels[i] = channel_level(&amplifier->channels[i], amplifier->sample, clock, before);
     for (uint8_t i = 0; i < LAYERS; i++) {
         const struct layer *layer = &amplifier->layers[i];
         bool is_buffered = layer->began + buffered > amplifier->sample;

@@ -28,6 +28,7 @@ from tests.firmware.firmware_machine import (
 TURN = 20.0  # s
 STEP = TURN / 2**16  # s; of the high word
 CLOCK_ERROR = 1e-6  # s; that it states
+LEVEL_ERROR = 1e-4  # a step
 MARK = 19
 OPERATIONAL, RESET_NODE = b"O\rt00020100\r", b"t00028100\r"
 TONE = hand.tone(0, 100, 0.5, 90)
@@ -119,6 +120,39 @@ def test_clock_is_the_time_of_the_output(built: Path, buffered: int) -> None:
     assert lead(buffered_clock, clock) == pytest.approx(0, abs=CLOCK_ERROR)
     extra_samples = buffered_samples - samples
     assert extra_samples == buffered
+
+
+def level_after(since: float, ramp: float) -> float:
+    """Return the level while a tone of 0.5 ends and one of 0.25 starts along a raised cosine.
+
+    since: time after their first sample [s]. ramp: length of the raised cosine [s].
+    """
+    way = min(max(since / ramp, 0.0), 1.0) if ramp else float(since >= 0)
+    risen = 0.5 - 0.5 * math.cos(math.pi * way)
+    return 0.5 * (1 - risen) + 0.25 * risen
+
+
+@pytest.mark.parametrize("ramp", [0, 5])
+def test_levels_are_those_of_the_output(rate: int, built: Path, ramp: int) -> None:
+    """From the moment of a set to the last sample of its ramp, although samples are made ahead."""
+    buffered = 40
+    firmware = MovedFirmware(built, buffered=buffered)
+    firmware.receive(SERIAL, arm())
+    firmware.receive(SERIAL, stage(1, hand.layer(0, TONE, ramp=0)))
+    firmware.receive(SERIAL, commit(1, 0))
+    firmware.move(0.1)
+    firmware.receive(SERIAL, stage(2, hand.layer(0, hand.tone(0, 130, 0.25, 0), ramp=ramp)))
+    moment = high_word_of(firmware) + 50
+    firmware.receive(SERIAL, commit(2, moment))
+    start = math.ceil(moment * STEP * rate) / rate
+    for number in range(400):
+        firmware.move(0.11 + 0.0000625 * number)
+        status = values_of(firmware, hand.GET_STATUS)
+        since = lead(status["clock"] / 2**32 * TURN, start)
+        limits = [level_after(since, ramp / 1000)]
+        limits.append(level_after(since + 1 / rate + CLOCK_ERROR, ramp / 1000))
+        level = status["levels"][0] / 10_000
+        assert min(limits) - LEVEL_ERROR <= level <= max(limits) + LEVEL_ERROR, f"{since} s"
 
 
 @pytest.mark.parametrize(

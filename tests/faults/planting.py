@@ -16,6 +16,7 @@ Other languages (C, JavaScript) are compared token by token, without whitespace 
 
 import ast
 import builtins
+import contextlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
@@ -27,6 +28,7 @@ from typing import Any, NamedTuple
 _HOLE = "..."
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 _DEFINITIONS = (*_FUNCTIONS, ast.ClassDef)
+_BLOCKS = ("body", "orelse", "finalbody")
 _BUILTIN_NAMES = frozenset(dir(builtins))
 
 
@@ -242,51 +244,133 @@ def _parsed(text: str, key: str) -> list[ast.stmt]:
     return statements
 
 
-@dataclass(frozen=True)
-class _Match:
-    """Code that a pattern matches: an expression, or statements of a block from `start` on."""
+class _Place(NamedTuple):
+    """A node of a tree, the node that holds it, and the outermost function around it."""
 
-    binding: _Binding
-    line: int
-    owner: ast.AST
-    expression: ast.expr | None = None
-    block: list[ast.stmt] = field(default_factory=list)
-    start: int = 0
-    count: int = 0
+    node: ast.AST
+    owner: ast.AST | None
+    function: ast.AST | None
 
 
-def _plant_python(edit: Edit, source: str) -> str:
-    tree = ast.parse(source)
+class _Source:
+    """A parsed file: its lines, its global names, and the places of its nodes."""
+
+    def __init__(self, text: str) -> None:
+        self.lines = text.split("\n")
+        self.tree = ast.parse(text)
+        self.global_names = _BUILTIN_NAMES | _global_names(self.tree)
+        self.whole = _Place(self.tree, None, None)
+        self._places: dict[ast.AST, list[_Place]] = {}
+
+    def places_in(self, scope: _Place) -> Sequence[_Place]:
+        """Return the places of a scope and of all nodes below it."""
+        if scope.node not in self._places:
+            self._places[scope.node] = [*_places(scope)]
+        return self._places[scope.node]
+
+    def text_with(self, statement: ast.stmt) -> str:
+        """Return the text with a statement of the module as it is now in the tree."""
+        numbers = _lines_of(statement)
+        lines = list(self.lines)
+        lines[numbers.start - 1 : numbers.stop - 1] = [ast.unparse(statement)]
+        return "\n".join(lines)
+
+
+_parsed_source = lru_cache(maxsize=8)(_Source)
+"""The last sources: many faults change the same file."""
+
+
+def _plant_python(edit: Edit, source_text: str) -> str:
+    source = _parsed_source(source_text)
     pattern = _parsed(edit.find, "find")
     replacement = _parsed(edit.replace, "replace")
     _check_private_names(pattern, replacement)
-    scopes = _scopes(tree, edit.scope)
+    scopes = _scopes(source, edit.scope)
+    candidates = _candidates(source, scopes, pattern, replacement)
     for freedom in _FREEDOMS:
-        matches = _matches(tree, scopes, pattern, replacement, freedom)
+        matches = _matches(source, candidates, pattern, freedom)
         if len(matches) > 1:
             lines = ", ".join(map(str, sorted(match.line for match in matches)))
             where = f" of {edit.scope}" if edit.scope else ""
             raise StaleEdit(f"matches in lines {lines}{where}, must match once: {edit.find}")
         if matches:
-            _put(matches[0], replacement)
-            return ast.unparse(tree) + "\n"
-    raise StaleEdit(_nothing_matches(edit, pattern, [scope for scope, _ in scopes]))
+            return _text_with_replacement(source, matches[0], replacement)
+    raise StaleEdit(_nothing_matches(edit, pattern, [scope.node for scope in scopes]))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """Code that a pattern can match: an expression, or statements of a block from `start` on."""
+
+    owner: ast.AST
+    function: ast.AST | None
+    expression: ast.expr | None = None
+    block: list[ast.stmt] = field(default_factory=list)
+    start: int = 0
+
+
+def _candidates(
+    source: _Source,
+    scopes: Sequence[_Place],
+    pattern: list[ast.stmt],
+    replacement: list[ast.stmt],
+) -> list[_Candidate]:
+    """Return the code in scopes that begins with a node of the same type as a pattern."""
+    first = pattern[0]
+    if _is_expression(pattern) and _is_expression(replacement):
+        assert isinstance(first, ast.Expr)
+        wanted = ast.expr if _is_hole(first.value) else type(first.value)
+        candidate_at = _expression_at
+    else:
+        wanted = ast.stmt if _is_hole_statement(first) else type(first)
+        candidate_at = _statements_at
+    return [
+        candidate_at(place)
+        for scope in scopes
+        for place in source.places_in(scope)
+        if isinstance(place.node, wanted) and place.owner is not None
+    ]
+
+
+def _expression_at(place: _Place) -> _Candidate:
+    assert isinstance(place.node, ast.expr)
+    assert place.owner is not None
+    return _Candidate(place.owner, place.function, expression=place.node)
+
+
+def _statements_at(place: _Place) -> _Candidate:
+    assert place.owner is not None
+    for name in _BLOCKS:
+        block = getattr(place.owner, name, None)
+        if isinstance(block, list) and place.node in block:
+            start = block.index(place.node)
+            return _Candidate(place.owner, place.function, block=block, start=start)
+    raise AssertionError(f"{ast.dump(place.node)} is not in a block of {ast.dump(place.owner)}")
+
+
+@dataclass(frozen=True)
+class _Match:
+    """A candidate that a pattern matches; of a block, `count` statements."""
+
+    binding: _Binding
+    candidate: _Candidate
+    count: int = 0
+
+    @property
+    def line(self) -> int:
+        """The first line of the matched code."""
+        if self.candidate.expression is not None:
+            return self.candidate.expression.lineno
+        return self.candidate.block[self.candidate.start].lineno
 
 
 def _matches(
-    tree: ast.Module,
-    scopes: Sequence[tuple[ast.AST, ast.AST | None]],
-    pattern: list[ast.stmt],
-    replacement: list[ast.stmt],
-    freedom: _Freedom,
+    source: _Source, candidates: Sequence[_Candidate], pattern: list[ast.stmt], freedom: _Freedom
 ) -> list[_Match]:
-    global_names = _BUILTIN_NAMES | _global_names(tree)
-    are_expressions = _is_expression(pattern) and _is_expression(replacement)
     matches: list[_Match] = []
-    for scope, around in scopes:
-        for owner, function in _nodes(scope, around):
-            matcher = _Matcher(freedom, function, global_names)
-            matches += _matches_in(owner, pattern, matcher, are_expressions)
+    for candidate in candidates:
+        matcher = _Matcher(freedom, candidate.function, source.global_names)
+        matches += _matches_of(candidate, pattern, matcher)
     return matches
 
 
@@ -312,18 +396,18 @@ def _private_names(statements: Sequence[ast.AST]) -> set[str]:
     return names
 
 
-def _scopes(tree: ast.Module, dotted: str) -> list[tuple[ast.AST, ast.AST | None]]:
-    """Return the definitions of a dotted name, with the outermost function around each."""
-    scopes: list[tuple[ast.AST, ast.AST | None]] = [(tree, None)]
+def _scopes(source: _Source, dotted: str) -> list[_Place]:
+    """Return the definitions of a dotted name."""
+    scopes = [source.whole]
     for name in filter(None, dotted.split(".")):
         below = []
         existing = []
-        for scope, around in scopes:
-            for node, function in _nodes(scope, around):
-                if isinstance(node, _DEFINITIONS) and node is not scope:
-                    existing.append(node.name)
-                    if node.name == name:
-                        below.append((node, function))
+        for scope in scopes:
+            for place in source.places_in(scope):
+                if isinstance(place.node, _DEFINITIONS) and place.node is not scope.node:
+                    existing.append(place.node.name)
+                    if place.node.name == name:
+                        below.append(place)
         if not below:
             similar = get_close_matches(name, existing, n=1)
             hint = f"; did you mean {similar[0]}?" if similar else ""
@@ -332,17 +416,15 @@ def _scopes(tree: ast.Module, dotted: str) -> list[tuple[ast.AST, ast.AST | None
     return scopes
 
 
-def _nodes(
-    node: ast.AST, function: ast.AST | None = None
-) -> Iterator[tuple[ast.AST, ast.AST | None]]:
-    """Yield a node and all below it, with the outermost function around each."""
-    queue = [(node, function)]
+def _places(scope: _Place) -> Iterator[_Place]:
+    """Yield a place and those of all nodes below it."""
+    queue = [scope]
     while queue:
-        node, function = queue.pop()
+        node, owner, function = queue.pop()
         if function is None and isinstance(node, _FUNCTIONS):
             function = node
-        yield node, function
-        queue += [(child, function) for child in ast.iter_child_nodes(node)]
+        yield _Place(node, owner, function)
+        queue += [_Place(child, node, function) for child in ast.iter_child_nodes(node)]
 
 
 @lru_cache(maxsize=256)
@@ -376,40 +458,67 @@ def _is_expression(statements: list[ast.stmt]) -> bool:
     return len(statements) == 1 and isinstance(statements[0], ast.Expr)
 
 
-def _matches_in(
-    owner: ast.AST, pattern: list[ast.stmt], matcher: _Matcher, are_expressions: bool
+def _matches_of(
+    candidate: _Candidate, pattern: list[ast.stmt], matcher: _Matcher
 ) -> Iterator[_Match]:
-    """Yield the matches among the direct children of a node."""
-    if are_expressions:
+    """Yield each way in which a pattern fits a candidate."""
+    if candidate.expression is not None:
         assert isinstance(pattern[0], ast.Expr)
-        for child in ast.iter_child_nodes(owner):
-            if isinstance(child, ast.expr):
-                for bound in matcher.match(pattern[0].value, child, _Binding()):
-                    yield _Match(bound, child.lineno, owner, expression=child)
+        for bound in matcher.match(pattern[0].value, candidate.expression, _Binding()):
+            yield _Match(bound, candidate)
         return
-    for _, block in ast.iter_fields(owner):
-        if not (isinstance(block, list) and block and isinstance(block[0], ast.stmt)):
-            continue
-        for start in range(len(block)):
-            for bound, count in matcher.match_start(pattern, block[start:], _Binding()):
-                line = block[start].lineno
-                yield _Match(bound, line, owner, block=block, start=start, count=count)
+    statements = candidate.block[candidate.start :]
+    for bound, count in matcher.match_start(pattern, statements, _Binding()):
+        yield _Match(bound, candidate, count)
 
 
-def _put(match: _Match, replacement: list[ast.stmt]) -> None:
-    """Put the replacement in place of matched code."""
+def _text_with_replacement(source: _Source, match: _Match, replacement: list[ast.stmt]) -> str:
+    """Return a source's text with matched code replaced; its tree stays as it is."""
     filled = _Filling(match.binding).fill(replacement)
-    if match.expression is None:
-        match.block[match.start : match.start + match.count] = filled
-        if not match.block:
-            match.block.append(ast.Pass())
+    owner = match.candidate.owner
+    [top_level] = [node for node in source.tree.body if match.line in _lines_of(node)]
+    with _restored_fields(owner):
+        _put(match, filled)
+        if owner is source.tree:
+            return ast.unparse(source.tree) + "\n"
+        return source.text_with(top_level)
+
+
+def _lines_of(statement: ast.stmt) -> range:
+    decorators = getattr(statement, "decorator_list", [])
+    first_line = min(node.lineno for node in [statement, *decorators])
+    return range(first_line, (statement.end_lineno or first_line) + 1)
+
+
+@contextlib.contextmanager
+def _restored_fields(node: ast.AST) -> Iterator[None]:
+    """Give a node its present fields back, and each of its lists the present items."""
+    fields = dict(ast.iter_fields(node))
+    items = {name: [*value] for name, value in fields.items() if isinstance(value, list)}
+    try:
+        yield
+    finally:
+        for name, value in fields.items():
+            setattr(node, name, value)
+        for name, values in items.items():
+            fields[name][:] = values
+
+
+def _put(match: _Match, filled: list[ast.stmt]) -> None:
+    """Put a filled replacement in place of matched code."""
+    owner, expression = match.candidate.owner, match.candidate.expression
+    if expression is None:
+        block, start = match.candidate.block, match.candidate.start
+        block[start : start + match.count] = filled
+        if not block:
+            block.append(ast.Pass())
         return
     assert isinstance(filled[0], ast.Expr)
-    for name, value in ast.iter_fields(match.owner):
-        if value is match.expression:
-            setattr(match.owner, name, filled[0].value)
+    for name, value in ast.iter_fields(owner):
+        if value is expression:
+            setattr(owner, name, filled[0].value)
         elif isinstance(value, list):
-            value[:] = [filled[0].value if item is match.expression else item for item in value]
+            value[:] = [filled[0].value if item is expression else item for item in value]
 
 
 class _Filling(ast.NodeTransformer):

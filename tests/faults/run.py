@@ -133,20 +133,20 @@ def changed_texts(fault: PlantedFault, tree: Path) -> dict[str, str]:
         source = texts.get(edit.file) or path.read_text("utf-8")
         try:
             texts[edit.file] = planted(edit, source)
-            if edit.file.endswith(".py"):
-                compile(texts[edit.file], edit.file, "exec")
-        except SyntaxError as error:
-            raise StaleEdit(f"{edit.file} must be Python once changed, got {error}") from error
         except StaleEdit as error:
             raise StaleEdit(f"{edit.file} {error}") from error
     return texts
+
+
+def _first_file(fault: PlantedFault) -> str:
+    return fault.edits[0].file
 
 
 def stale_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
     """Describe each fault that cannot be planted in a tree, or whose code has undefined names."""
     reports = []
     changed = []
-    for fault in faults:
+    for fault in sorted(faults, key=_first_file):
         try:
             changed.append((fault, changed_texts(fault, tree)))
         except StaleEdit as error:
@@ -162,7 +162,7 @@ def stale_report(faults: Iterable[PlantedFault], tree: Path) -> list[str]:
 
 
 def _undefined_names(changed: Iterable[tuple[PlantedFault, Mapping[str, str]]]) -> list[str]:
-    """Describe each undefined name in the files that faults change, as ruff finds it."""
+    """Describe each undefined name and syntax error in changed files, as ruff finds it."""
     described = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

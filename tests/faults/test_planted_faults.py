@@ -89,7 +89,7 @@ def test_pattern_matches_code_with_other_names_and_layout(
     edit = Edit("valve.py", "Valve", find, replacement)
     assert planted(edit, SOURCE) != SOURCE
     original = ast.unparse(ast.parse(REWRITTEN)).splitlines()
-    mutated = planted(edit, REWRITTEN).splitlines()
+    mutated = ast.unparse(ast.parse(planted(edit, REWRITTEN))).splitlines()
     changed = [new.strip() for old, new in zip(original, mutated, strict=True) if old != new]
     assert changed == [line]
 

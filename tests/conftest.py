@@ -142,6 +142,15 @@ def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("model.figures.style.DPI", 20)
 
 
+@pytest.fixture
+def assumed_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Costs of tolerances in checks of rigs, without the table from which they are computed."""
+    from model.study.promise_cost import ToleranceCosts
+
+    costs = ToleranceCosts(20.0, {"weather": 1.0, "foreign_mass": 1.0})
+    monkeypatch.setattr("controller.rig_file_check.uncertainty_costs", lambda rig: costs)
+
+
 @pytest.fixture(scope="session")
 def rig() -> Rig:
     """The paper's plate as its file has it."""

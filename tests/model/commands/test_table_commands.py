@@ -106,6 +106,7 @@ def test_show_ends_with_a_query_that_has_an_answer(show_lines: list[str]) -> Non
     assert as_json(*arguments)["promised_worst_db"] > 0
 
 
+@pytest.mark.usefixtures("assumed_costs")
 def test_commands_warn_if_there_are_no_kernels(
     without_kernels: Callable[[], None], tmp_path: Path
 ) -> None:
@@ -262,6 +263,7 @@ def files_in(folder: Path) -> set[Path]:
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=case["printed"]) for case in CASES])
+@pytest.mark.usefixtures("assumed_costs")
 def test_command_prints_and_writes_the_output_of_its_case(
     case: Mapping[str, Any],
     folder: Path,

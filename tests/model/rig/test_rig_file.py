@@ -204,6 +204,7 @@ def test_feet_have_a_tolerance_unless_it_is_stated(
     ],
     ids=["acrylic", "plywood", "by name", "by numbers", "not stated"],
 )
+@pytest.mark.usefixtures("assumed_costs")
 def test_weather_adds_to_the_tolerance_of_a_measured_plate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], material: str, keys: str, change: float
 ) -> None:
@@ -420,6 +421,7 @@ def test_check_rejects_a_plate_that_tips_over(tmp_path: Path) -> None:
         check_rig(read_document(path))
 
 
+@pytest.mark.usefixtures("assumed_costs")
 def test_check_warns_of_a_stiff_spring_at_a_point(tmp_path: Path) -> None:
     """On 1.5 mm of aluminium a tenfold smaller point yields 11.1 nm/N: ln 10 / (2 pi 5/6 G h)."""
     old = "stiffness: 17000"
@@ -443,6 +445,7 @@ def test_check_warns_of_a_stiff_spring_at_a_point(tmp_path: Path) -> None:
         ("0.05 mm, closed: true", "off by 50 %"),
     ],
 )
+@pytest.mark.usefixtures("assumed_costs")
 def test_check_warns_of_friction_in_a_thin_air_gap(
     tmp_path: Path, gap: str, error: str | None
 ) -> None:
@@ -456,6 +459,7 @@ def test_check_warns_of_friction_in_a_thin_air_gap(
         assert str(error) in warning
 
 
+@pytest.mark.usefixtures("assumed_costs")
 def test_check_warns_of_faces_that_slide_on_soft_foam(tmp_path: Path) -> None:
     """By hand sqrt(2 x 40e3 / (0.05 x 1.767)) / 2 pi = 151 Hz for foam of G 40 kPa.
 

@@ -177,6 +177,7 @@ def universal_text(modes: Modes) -> str:
 
 
 @pytest.mark.parametrize("case", ODD_MODES, ids=str)
+@pytest.mark.usefixtures("assumed_costs")
 def test_odd_modes_are_read_or_rejected_with_their_location(
     case: Mapping[str, Any], universal_text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

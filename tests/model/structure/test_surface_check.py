@@ -338,6 +338,7 @@ def test_held_panel_of_another_scale_is_rejected(
 # Suspicious modes
 
 
+@pytest.mark.usefixtures("assumed_costs")
 def test_mode_identified_twice_is_a_warning_in_every_entry(
     free_modes: Modes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

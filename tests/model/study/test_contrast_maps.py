@@ -172,6 +172,7 @@ USB_US = round(1e6 * math.hypot(CLOCK_ERRORS["ftdi-low-latency"], 5e-6 / math.sq
 @pytest.mark.parametrize(
     ("keys", "error_us", "warning_count"), [("", USB_US, 1), (", clock_error: unknown", None, 2)]
 )
+@pytest.mark.usefixtures("assumed_costs")
 def test_config_check_reports_the_cost_of_clock_errors(
     tmp_path: Path, keys: str, error_us: float | None, warning_count: int
 ) -> None:

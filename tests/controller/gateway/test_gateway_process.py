@@ -54,7 +54,6 @@ from processes.gateways import (
 )
 from processes.installed import installed_program
 
-
 PATIENT = (
     *(sys.executable, "-c"),
     f"from controller.api import link; link.RESPONSE_TIMEOUT = {2 * PATIENCE}; "

@@ -14,9 +14,10 @@ from kit.plates import SMALL_TABLE_HZ, contact_sets, smooth_rig, smooth_table
 from kit.set_table import only, phased, wants
 from model.answer import plan
 from model.answer.envelope import Course
+from model.answer.fingers_on_plate import DriveTones, FingersOnPlate
 from model.answer.plan import query
-from model.answer.promise import share_stroke
-from model.answer.question import Contents, Stream
+from model.answer.promise import promised, share_stroke
+from model.answer.question import Contents, Stream, Tones
 from model.answer.stimulus import Finger, Placement, Stimulus, check_fingers, together
 from model.answer.tone_search import choose_by_numpy, choose_tones
 from model.arrays import Point
@@ -114,11 +115,23 @@ TWENTY_POSITIONS = [*ROWS, *((x + 0.028, y) for x, y in ROWS)]
 CASES = read_yaml(FOLDER / "kernel_contents.yaml")
 
 
+def gains_of_weights(table: LocalizationTable, contents: Contents, tones: Tones) -> list[float]:
+    """Return the gains that numpy computes for the weights of tones."""
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=False)
+    weights = np.array(tones.weights, np.complex64)
+    drives = DriveTones(np.array(tones.rows), weights, np.array(tones.owners))
+    return promised(fingers, contents, drives).gains
+
+
 @pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize("seed", shortly(range(3), [0]))
 @pytest.mark.parametrize("name", CASES)
 def test_kernel_agrees_with_numpy(name: str, seed: int) -> None:
-    """In frequencies and weights, and in all figures within 0.03 dB, on random rigs."""
+    """In frequencies and weights, and in all figures within 0.03 dB, on random rigs.
+
+    Searches end near the optimum, at weights that differ by up to 0.12 %. Gains follow from the
+    weights to single precision, so they are compared at the same weights.
+    """
     table = random_table(seed)
     contents = Case(**CASES[name]).contents_on(table, seed)
 
@@ -128,7 +141,7 @@ def test_kernel_agrees_with_numpy(name: str, seed: int) -> None:
     assert tones.rows == expected.rows
     assert tones.is_apart == expected.is_apart
     np.testing.assert_allclose(np.abs(tones.weights), np.abs(expected.weights), atol=0.02)
-    np.testing.assert_allclose(tones.gains, expected.gains, rtol=3e-3)
+    np.testing.assert_allclose(tones.gains, gains_of_weights(table, contents, tones), rtol=1e-4)
     np.testing.assert_allclose(tones.stroke_factor, expected.stroke_factor, rtol=2e-3)
     for key in ("contrast_db", "level_db_sl", "foreign_db_sl", "worst_db"):
         values = getattr(tones, key)

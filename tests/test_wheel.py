@@ -269,7 +269,7 @@ assert era("design", RIG, "--mesh", "11x9", "--layouts", "random:1", "--finalist
 @pytest.mark.parametrize(
     ("has_kernels", "work"),
     [
-        pytest.param(False, "", id="shown"),
+        pytest.param(True, "", id="shown"),
         pytest.param(False, WORK + DESIGN, id="numpy-design", marks=pytest.mark.long),
         pytest.param(True, WORK + DESIGN, id="c-design", marks=pytest.mark.long),
     ],

@@ -408,7 +408,10 @@ def install_completion(shell: str, home: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("typed", "words"),
-    [("era con", {"config", "content"}), ("era content check tick --qu", {"--quiet"})],
+    [
+        pytest.param("era con", {"config", "content"}, marks=pytest.mark.long),
+        ("era content check tick --qu", {"--quiet"}),
+    ],
 )
 def test_fish_completes_commands_and_options(tmp_path: Path, typed: str, words: set[str]) -> None:
     """After `era --install-completion`, by fish's own list of completions with descriptions."""
@@ -425,7 +428,10 @@ def test_fish_completes_commands_and_options(tmp_path: Path, typed: str, words: 
 
 @pytest.mark.parametrize(
     ("typed", "completed"),
-    [("era conf\t", "ig"), ("era content check tick --qu\t", "iet")],
+    [
+        ("era conf\t", "ig"),
+        pytest.param("era content check tick --qu\t", "iet", marks=pytest.mark.long),
+    ],
 )
 def test_zsh_completes_commands_and_options(tmp_path: Path, typed: str, completed: str) -> None:
     """After `era --install-completion`, typed with Tab in an interactive zsh on a terminal.

@@ -31,7 +31,8 @@ def write_paper_rig(folder: Path) -> Path:
     """Write the rig into a new folder."""
     folder.mkdir()
     warned = ("  level: 1.0", "  level: 1.0\nuncertainty: {thickness: 0}")
-    return write_rig(folder / NAME, warned)
+    few_frequencies = ("[40 Hz, 500 Hz]", "[40 Hz, 250 Hz]")
+    return write_rig(folder / NAME, warned, few_frequencies)
 
 
 @pytest.fixture(scope="module")

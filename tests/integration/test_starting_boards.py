@@ -27,7 +27,11 @@ SERIAL = ["serial", "modbus+rtu", "can+slcan"]
 
 @pytest.mark.parametrize(
     ("boots", "openings"),
-    [pytest.param(0.8, 1, marks=pytest.mark.long), (5.0, 1), (9.0, 2)],
+    [
+        pytest.param(0.8, 1, marks=pytest.mark.long),
+        pytest.param(5.0, 1, marks=pytest.mark.long),
+        (9.0, 2),
+    ],
 )
 @in_virtual_time
 async def test_daemon_reaches_it_at_the_first_opening(

@@ -258,7 +258,11 @@ def backwards(measurement: Measurement) -> Measurement:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (in_g, r"must be acceleration in m/s².* responses of about 0\.1.* check the units"),
+        pytest.param(
+            in_g,
+            r"must be acceleration in m/s².* responses of about 0\.1.* check the units",
+            marks=pytest.mark.long,
+        ),
         (with_inverted_sensor, "must be acceleration in m/s²"),
         (
             without_southeast,

@@ -409,7 +409,12 @@ def test_check_finds_planted_faults_and_nothing_else(name: str) -> None:
             r"^resonance_is of NE, NW, SW, SE must be mounted, got free: .* at 306 Hz",
             marks=pytest.mark.long,
         ),
-        (CUT_ACROSS, WEEKEND, r"^plate\.grain must be width, got length: "),
+        pytest.param(
+            CUT_ACROSS,
+            WEEKEND,
+            r"^plate\.grain must be width, got length: ",
+            marks=pytest.mark.long,  # `test_command_writes_no_rig_for_a_board_cut_the_other_way`
+        ),
     ],
     ids=["free", "mounted", "cut the other way"],
 )

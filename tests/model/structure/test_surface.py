@@ -142,7 +142,10 @@ def csv_file(modes: Modes) -> str:
     return "\n".join([*rows, ""])
 
 
-@pytest.mark.parametrize(("kind", "length"), [(55, 1.0), (2414, 1.0), (55, 1000.0), (0, 1.0)])
+@pytest.mark.parametrize(
+    ("kind", "length"),
+    [pytest.param(55, 1.0, marks=pytest.mark.long), (2414, 1.0), (55, 1000.0), (0, 1.0)],
+)
 def test_plate_by_its_own_modes_has_the_fields_of_its_table(
     modes: Modes, paper_table: LocalizationTable, kind: int, length: float, tmp_path: Path
 ) -> None:

@@ -345,12 +345,12 @@ KNOWN_DRIVES = replace(Uncertainty.none(), gain=0.01, phase_deg=1.0)
 @pytest.mark.parametrize(
     ("uncertainty", "percentile", "quiet_count", "optimum_db"),
     [
-        (Uncertainty(), 10, 1, 16.1),
-        (Uncertainty(), 10, 2, 12.5),
+        pytest.param(Uncertainty(), 10, 1, 16.1, marks=pytest.mark.long),
+        pytest.param(Uncertainty(), 10, 2, 12.5, marks=pytest.mark.long),
         (Uncertainty(), 10, 3, 9.5),
         (KNOWN_DRIVES, 50, 1, 33.0),
-        (KNOWN_DRIVES, 50, 2, 18.0),
-        (KNOWN_DRIVES, 50, 3, 14.5),
+        pytest.param(KNOWN_DRIVES, 50, 2, 18.0, marks=pytest.mark.long),
+        pytest.param(KNOWN_DRIVES, 50, 3, 14.5, marks=pytest.mark.long),
     ],
 )
 def test_answers_reach_the_contrast_of_an_independent_optimum(
